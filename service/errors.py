@@ -1,0 +1,87 @@
+"""Every error that Quadlift raises on purpose, and the HTTP status that each one carries.
+
+    QuadliftError (500)
+    |-- InputError (422)            a value that the caller can mend
+    |   |-- FrameError (422)        not an image, truncated, wrong size
+    |   |-- TooLargeError (413)     more bytes, pixels or parts than the limits allow
+    |   |-- CalibrationError (422)  camera, ground plane or site that cannot be used
+    |   `-- NotFoundError (404)     unknown site, camera or frame
+    |-- OverloadError (503)         busy or starting; Retry-After says when to come back
+    `-- PackError (500)             a pack that is missing, damaged or not what its manifest says
+
+The way of a request is bytes -> header check -> decode -> networks -> boxes; the first three raise only InputError kinds.
+"""
+
+from __future__ import annotations
+
+
+class QuadliftError(Exception):
+    """Base of all errors. ``message`` says what is wrong, ``field`` where, ``remedy`` what to do about it."""
+
+    status = 500
+    code = "internal"
+
+    def __init__(self, message: str, *, field: str | None = None, remedy: str | None = None) -> None:
+        super().__init__(message)
+        self.message = message
+        self.field = field
+        self.remedy = remedy
+
+    def __str__(self) -> str:
+        parts = [f"{self.field}: {self.message}" if self.field else self.message]
+        if self.remedy:
+            parts.append(self.remedy)
+        return " ".join(parts)
+
+
+class InputError(QuadliftError):
+    """A value given by the caller cannot be used."""
+
+    status = 422
+    code = "invalid_input"
+
+
+class FrameError(InputError):
+    """A frame is not an image, is truncated, or has another size than its camera's."""
+
+    code = "invalid_frame"
+
+
+class TooLargeError(InputError):
+    """A request holds more bytes, pixels or parts than the limits allow."""
+
+    status = 413
+    code = "too_large"
+
+
+class CalibrationError(InputError):
+    """A camera, a ground plane or a whole site cannot be used for geometry."""
+
+    code = "invalid_calibration"
+
+
+class NotFoundError(InputError):
+    """A site, a camera or a frame that nobody registered."""
+
+    status = 404
+    code = "not_found"
+
+
+class OverloadError(QuadliftError):
+    """The service is starting or has more work than it can do in time.
+
+    ``retry_after_s`` (seconds) becomes the Retry-After header.
+    """
+
+    status = 503
+    code = "overloaded"
+
+    def __init__(self, message: str, *, retry_after_s: int = 1, remedy: str | None = None) -> None:
+        super().__init__(message, remedy=remedy)
+        self.retry_after_s = retry_after_s
+
+
+class PackError(QuadliftError):
+    """A pack's file is missing, altered, or not what its manifest says."""
+
+    code = "invalid_pack"

@@ -1,0 +1,95 @@
+"""Oriented 3D boxes in the world frame, as arrays.
+
+``center`` is the geometric centre, ``dims_lwh`` length, width, height in metres, ``yaw`` counter-clockwise from East about
+gravity in [-pi, pi); the box's length runs along its heading. A covariance is 7x7 over (x, y, z, l, w, h, yaw).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from service.geometry.camera import MIN_DEPTH_M, Camera
+from service.geometry.transforms import Array, transform_points
+
+CORNER_SIGNS = np.array([[sx, sy, sz] for sz in (-1, 1) for sx, sy in ((1, 1), (-1, 1), (-1, -1), (1, -1))], dtype=np.float64)
+"""Signs (8, 3) of the corners over (length, width, height): bottom four first, counter-clockwise seen from above."""
+
+STATE_DIM = 7
+"""x, y, z, length, width, height, yaw."""
+
+
+@dataclass(frozen=True, eq=False)
+class Boxes:
+    """N boxes in the world frame; every array has N rows."""
+
+    center: Array
+    """(N, 3) geometric centres, metres."""
+    dims_lwh: Array
+    """(N, 3) length, width, height, metres."""
+    yaw: Array
+    """(N,) radians in [-pi, pi)."""
+    score: Array
+    """(N,) in 0..1."""
+    cls: NDArray[np.int64]
+    """(N,) class indices into the pack's classes."""
+    covariance: Array
+    """(N, 7, 7) over x y z l w h yaw."""
+    flip_log_odds: Array
+    """(N,) log-odds that the heading is ``yaw`` rather than ``yaw + pi``."""
+
+    def __len__(self) -> int:
+        return len(self.yaw)
+
+    def take(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Boxes:
+        """The boxes at an index or mask."""
+        return Boxes(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    @staticmethod
+    def empty() -> Boxes:
+        """No boxes."""
+        return Boxes(
+            np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 7, 7)), np.zeros(0)
+        )
+
+    @staticmethod
+    def concatenate(parts: list[Boxes]) -> Boxes:
+        """All boxes of several lists, in order."""
+        if not parts:
+            return Boxes.empty()
+        return Boxes(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Boxes)})
+
+
+def box_corners(center: ArrayLike, dims_lwh: ArrayLike, yaw: ArrayLike) -> Array:
+    """World corners (..., 8, 3) in the order of ``CORNER_SIGNS`` of boxes (..., 3), (..., 3), (...)."""
+    center = np.asarray(center, dtype=np.float64)
+    offsets = 0.5 * CORNER_SIGNS * np.asarray(dims_lwh, dtype=np.float64)[..., None, :]
+    c, s = np.cos(yaw)[..., None], np.sin(yaw)[..., None]
+    x, y = offsets[..., 0], offsets[..., 1]
+    rotated = np.stack([c * x - s * y, s * x + c * y, offsets[..., 2]], -1)
+    return center[..., None, :] + rotated
+
+
+def box_states(boxes: Boxes) -> Array:
+    """State vectors (N, 7): x y z l w h yaw."""
+    return np.concatenate([boxes.center, boxes.dims_lwh, boxes.yaw[:, None]], 1)
+
+
+def project_extents(camera: Camera, center: ArrayLike, dims_lwh: ArrayLike, yaw: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+    """Extents of projected boxes in a camera.
+
+    Returns xyxy (N, 4) in px, not clipped to the image, and in_front (N,): all eight corners before the camera. Where
+    in_front is False the extents are not meaningful.
+    """
+    corners_cam = transform_points(camera.T_cam_world, box_corners(center, dims_lwh, yaw))
+    pixels = camera.project_cam(corners_cam)
+    in_front = np.all(corners_cam[..., 2] > MIN_DEPTH_M, axis=-1)
+    return np.concatenate([pixels.min(axis=-2), pixels.max(axis=-2)], -1), in_front
+
+
+def clip_extents(camera: Camera, xyxy: ArrayLike) -> Array:
+    """2D boxes (N, 4) clipped to the image, whose pixels span [0, width - 1] x [0, height - 1]."""
+    limits = np.array([camera.width - 1, camera.height - 1] * 2, dtype=np.float64)
+    return np.clip(np.asarray(xyxy, dtype=np.float64), 0.0, limits)
