@@ -21,10 +21,14 @@ ID_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 
 MAX_SIDE_PX = 16384
 _ROTATION_TOLERANCE = 1e-3
+_ROTATION_ROUNDING = 1e-12
 _MIN_FOCAL_PX = 1.0
 _DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+_MAX_NUMBER = 1e8
+"""Above any projected map coordinate in metres; larger numbers are mistakes, and their products overflow."""
+
+Finite = Annotated[float, Field(allow_inf_nan=False, ge=-_MAX_NUMBER, le=_MAX_NUMBER)]
 Row3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 Row4 = Annotated[list[Finite], Field(min_length=4, max_length=4)]
 
@@ -110,12 +114,16 @@ def parse_site(document: Any) -> Site:
         first = error.errors(include_url=False)[0]
         location = ".".join(str(part) for part in first["loc"]) or "site"
         shown = repr(first.get("input"))[:80]
-        raise CalibrationError(f"{first['msg']} (got {shown}).", field=location, remedy="See the site file in the README.") from None
+        raise CalibrationError(
+            f"{first['msg']} (got {shown}).", field=location, remedy="See the site file in the README."
+        ) from None
     cameras = tuple(_camera(camera, f"cameras.{index}") for index, camera in enumerate(model.cameras))
     ids = [camera.id for camera in cameras]
     for index, camera_id in enumerate(ids):
         if camera_id in ids[:index]:
-            raise CalibrationError(f"'{camera_id}' stands twice.", field=f"cameras.{index}.id", remedy="Give each camera its own id.")
+            raise CalibrationError(
+                f"'{camera_id}' stands twice.", field=f"cameras.{index}.id", remedy="Give each camera its own id."
+            )
     return Site(model.id, cameras, _ground(model.ground), model.origin)
 
 
@@ -159,8 +167,10 @@ def _camera(model: CameraModel, where: str) -> Camera:
             field=f"{where}.distortion",
             remedy=f"OpenCV's model has one of {_DISTORTION_LENGTHS} coefficients.",
         )
-    U, _, Vt = np.linalg.svd(R)
-    T[:3, :3] = U @ Vt
+    # Only where digits were lost: a saved site then reads back bit by bit.
+    if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_ROUNDING:
+        U, _, Vt = np.linalg.svd(R)
+        T[:3, :3] = U @ Vt
     return Camera(model.id, model.width, model.height, K, T, np.array(model.distortion, dtype=np.float64))
 
 
@@ -202,7 +212,7 @@ def save_site(site: Site, path: Path) -> None:
             json.dump(site_document(site), stream, indent=1)
             stream.flush()
             os.fsync(stream.fileno())
-        os.replace(temporary, path)
+        Path(temporary).replace(path)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise

@@ -51,7 +51,13 @@ class Boxes:
     def empty() -> Boxes:
         """No boxes."""
         return Boxes(
-            np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 7, 7)), np.zeros(0)
+            np.zeros((0, 3)),
+            np.zeros((0, 3)),
+            np.zeros(0),
+            np.zeros(0),
+            np.zeros(0, np.int64),
+            np.zeros((0, 7, 7)),
+            np.zeros(0),
         )
 
     @staticmethod

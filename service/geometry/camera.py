@@ -11,6 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from service.geometry.transforms import Array, invert_rigid, transform_points, wrap_angle
 
+_ZERO = np.zeros(3)
+_NEWTON_STEPS = 4
+_MIN_SLOPE = 1e-3
+
 MIN_DEPTH_M = 0.1
 """Points nearer to the image plane than this count as not visible."""
 
@@ -84,14 +88,26 @@ class Camera:
         """Undistorted normalised coordinates (x/z, y/z) of pixels; both (..., 2)."""
         pixels = np.asarray(pixels, dtype=np.float64)
         if self.has_distortion:
-            if pixels.size == 0:
-                return np.zeros_like(pixels)
-            criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
-            undistorted = cv2.undistortPointsIter(
-                pixels.reshape(-1, 1, 2), self.K, self.distortion, np.eye(3), np.eye(3), criteria
-            )
-            return np.asarray(undistorted, dtype=np.float64).reshape(pixels.shape)
+            return self._undistorted(pixels.reshape(-1, 2)).reshape(pixels.shape)
         return (pixels - self.K[:2, 2]) @ np.linalg.inv(self.K[:2, :2]).T
+
+    def _undistorted(self, pixels: Array) -> Array:
+        """Inverse of the lens model for pixels (P, 2): OpenCV's start, then Newton on its projection.
+
+        OpenCV's own fixed-point iteration stops early on strong lenses, and its argument for more differs by version.
+        """
+        if len(pixels) == 0:
+            return np.zeros_like(pixels)
+        xy = cv2.undistortPoints(pixels[:, None], self.K, self.distortion).reshape(-1, 2).astype(np.float64)
+        for _ in range(_NEWTON_STEPS):
+            seen, jacobian = cv2.projectPoints(np.c_[xy, np.ones(len(xy))][:, None], _ZERO, _ZERO, self.K, self.distortion)
+            # Columns 3 and 4 are over the translation's x and y: at depth 1 those move x/z and y/z one to one.
+            slope = np.asarray(jacobian, dtype=np.float64)[:, 3:5].reshape(-1, 2, 2)
+            miss = pixels - np.asarray(seen, dtype=np.float64).reshape(-1, 2)
+            # Where the lens model folds back (far outside of the picture) it has no inverse: such points stay as they are.
+            invertible = np.isfinite(miss).all(1) & (np.linalg.det(slope) > _MIN_SLOPE * np.prod(np.diag(self.K)))
+            xy[invertible] += np.linalg.solve(slope[invertible], miss[invertible, :, None])[..., 0]
+        return xy
 
     def rays_world(self, pixels: ArrayLike) -> Array:
         """World directions (..., 3) through pixels (..., 2), scaled so that their depth in the camera is 1."""

@@ -22,7 +22,8 @@ class GroundPlane:
     def height_at(self, xy: ArrayLike) -> Array:
         """Heights z (...) of the ground under world positions (..., 2 or more), metres."""
         xy = np.asarray(xy, dtype=np.float64)
-        return (self.offset - xy[..., :2] @ self.normal[:2]) / self.normal[2]
+        height: Array = (self.offset - xy[..., :2] @ self.normal[:2]) / self.normal[2]
+        return height
 
     def intersect(self, origin_m: ArrayLike, directions: ArrayLike) -> Array:
         """Where rays from ``origin_m`` (3,) along ``directions`` (..., 3) meet the ground: points (..., 3).

@@ -65,10 +65,13 @@ def clip_convex_pairs(subject: Array, clip: Array) -> Array:
     vertices = np.where(valid[..., None], vertices, vertices[:, :1])
     origin = vertices[:, :1]
     relative = vertices - origin
-    return 0.5 * np.abs(_cross(relative[:, :-1], relative[:, 1:]).sum(1))
+    area: Array = 0.5 * np.abs(_cross(relative[:, :-1], relative[:, 1:]).sum(1))
+    return area
 
 
-def intersection_bev(a_xy: ArrayLike, a_lw: ArrayLike, a_yaw: ArrayLike, b_xy: ArrayLike, b_lw: ArrayLike, b_yaw: ArrayLike) -> Array:
+def intersection_bev(
+    a_xy: ArrayLike, a_lw: ArrayLike, a_yaw: ArrayLike, b_xy: ArrayLike, b_lw: ArrayLike, b_yaw: ArrayLike
+) -> Array:
     """Intersection areas (N, M) in m^2 of rotated rectangles a (N) and b (M) in bird's-eye view."""
     corners_a, corners_b = rectangle_corners(a_xy, a_lw, a_yaw), rectangle_corners(b_xy, b_lw, b_yaw)
     area = np.zeros((len(corners_a), len(corners_b)))

@@ -52,7 +52,8 @@ def invert_rigid(T: ArrayLike) -> Array:
 def transform_points(T: ArrayLike, points: ArrayLike) -> Array:
     """Apply one rigid transform (4, 4) to points (..., 3)."""
     T = np.asarray(T, dtype=np.float64)
-    return np.asarray(points, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
+    moved: Array = np.asarray(points, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
+    return moved
 
 
 def pole_camera_pose(position_m: ArrayLike, heading_rad: float, pitch_rad: float, roll_rad: float = 0.0) -> Array:

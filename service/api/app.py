@@ -1,0 +1,96 @@
+"""The app: settings in, an ASGI application out."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+from fastapi import FastAPI
+
+from service import __version__
+from service.api import detect, health, sites, stream, viewer
+from service.api.errors import install_error_handlers
+from service.api.guard import Guard
+from service.api.live import LiveSites, TrackerFactory, default_tracker
+from service.api.recent import RecentFrames
+from service.api.state import Service
+from service.errors import CalibrationError
+from service.scheduler import FrameSetRunner, Scheduler
+from service.settings import Settings
+from service.site import load_site
+from service.sites_store import SitesStore
+from service.telemetry import Telemetry
+
+PipelineFactory = Callable[[Settings], FrameSetRunner]
+
+_DESCRIPTION = """Oriented 3D boxes of vehicles from a few static, calibrated cameras.
+
+`WS /stream/{site}` sends the message of `POST /detect` for every frame set of a site, as JSON text or, with
+`?format=msgpack`, as MessagePack; while anybody listens, boxes carry `track_id` and `velocity`. Errors of all addresses
+have one form: `{"error": {"code", "message", "field", "remedy"}}`."""
+
+
+def create_app(
+    settings: Settings, pipeline_factory: PipelineFactory | None = None, tracker_factory: TrackerFactory | None = None
+) -> FastAPI:
+    """Build the app. Its lifespan loads the sites and the pack, then warms up while ``/health/live`` answers already.
+
+    The factories are seams for tests and for pipelines that are loaded before.
+    """
+    telemetry = Telemetry()
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        store = await asyncio.to_thread(open_store, settings)
+        runner = await asyncio.to_thread(pipeline_factory or default_pipeline, settings)
+        scheduler = Scheduler(
+            runner,
+            workers=settings.workers,
+            queue_size=settings.queue_size,
+            deadline_s=settings.deadline_ms / 1e3,
+            telemetry=telemetry,
+        )
+        live = LiveSites(
+            telemetry, tracker_factory or default_tracker, reset_s=settings.tracker_reset_s, max_readers=settings.max_readers
+        )
+        service = Service(settings, telemetry, store, scheduler, live, RecentFrames(settings.viewer_max_bytes))
+        app.state.service = service
+        warming = asyncio.create_task(service.warm_up(runner))
+        try:
+            yield
+        finally:
+            await asyncio.to_thread(service.stop)
+            await warming
+
+    app = FastAPI(title="Quadlift", version=__version__, description=_DESCRIPTION, lifespan=lifespan, redoc_url=None)
+    app.add_middleware(Guard, telemetry=telemetry)
+    install_error_handlers(app)
+    for room in (detect, sites, stream, health):
+        app.include_router(room.router)
+    if settings.viewer:
+        app.include_router(viewer.router)
+    return app
+
+
+def default_pipeline(settings: Settings) -> FrameSetRunner:
+    """The service's own pipeline on the pack that the settings name. Raises PackError."""
+    from service.nets.pack import load_pack
+    from service.pipeline import Pipeline, PipelineSettings
+
+    threshold = settings.score_threshold
+    options = (
+        PipelineSettings() if threshold is None else PipelineSettings(score_threshold=threshold, min_fused_score=threshold)
+    )
+    return Pipeline(load_pack(settings.pack, intra_op_threads=1), options)
+
+
+def open_store(settings: Settings) -> SitesStore:
+    """The store with the kept sites and those of ``settings.sites``. Raises CalibrationError naming the file."""
+    store = SitesStore(settings.data_dir, max_sites=settings.max_sites, max_cameras=settings.max_cameras)
+    for path in settings.sites:
+        try:
+            store.put(load_site(path))
+        except CalibrationError as error:
+            raise CalibrationError(f"{error.field}: {error.message}", field=str(path), remedy=error.remedy) from error
+    return store

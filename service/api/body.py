@@ -1,0 +1,126 @@
+"""Request bodies: limited while they arrive, parsed off the event loop."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+from starlette.requests import Request
+
+from service.errors import InputError, TooLargeError
+
+_FORM_REMEDY = "Send multipart/form-data with one file part a camera, for example: curl -F north=@north.jpg."
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One part of a multipart form."""
+
+    name: str
+    is_file: bool
+    """Whether the part has a file name."""
+    data: bytes
+
+
+async def read_body(request: Request, max_bytes: int) -> bytes:
+    """The request's body. Raises TooLargeError as soon as it is, or announces to be, longer than ``max_bytes``."""
+    announced = request.headers.get("content-length", "")
+    if announced.isdecimal() and int(announced) > max_bytes:
+        raise _too_long(f"{announced} bytes announced", max_bytes)
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > max_bytes:
+            raise _too_long("more bytes", max_bytes)
+    return bytes(body)
+
+
+def parse_json(body: bytes) -> Any:
+    """A JSON document; NaN and Infinity are read as such, so that validation can name their place. Raises InputError."""
+    try:
+        return json.loads(body)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"not JSON: {str(error)[:200]}.", field="body", remedy="Send a JSON document.") from None
+
+
+def parse_multipart(body: bytes, content_type: str | None, max_parts: int) -> list[Part]:
+    """The parts of a ``multipart/form-data`` body, in order. Raises InputError, TooLargeError."""
+    kind, options = parse_options_header(content_type)
+    boundary = options.get(b"boundary")
+    if kind != b"multipart/form-data" or not boundary:
+        raise InputError(f"the body is of type {(content_type or 'none')[:80]!r}.", field="Content-Type", remedy=_FORM_REMEDY)
+    collector = _Collector(body, max_parts)
+    try:
+        parser = MultipartParser(
+            boundary,
+            {
+                "on_part_begin": collector.begin,
+                "on_header_field": collector.header_name,
+                "on_header_value": collector.header_value,
+                "on_header_end": collector.header_end,
+                "on_part_data": collector.data,
+                "on_part_end": collector.end,
+                "on_end": collector.finish,
+            },
+        )
+        parser.write(body)
+        parser.finalize()
+    except FormParserError as error:
+        raise InputError(f"not a multipart form: {error}.", field="body", remedy=_FORM_REMEDY) from None
+    if not collector.finished:
+        raise InputError(
+            f"the multipart form of {len(body)} bytes ends before its closing boundary.", field="body", remedy=_FORM_REMEDY
+        )
+    return collector.parts
+
+
+class _Collector:
+    """Callbacks of the multipart parser: they give slices of the body, and end up as parts."""
+
+    def __init__(self, body: bytes, max_parts: int) -> None:
+        self.parts: list[Part] = []
+        self.finished = False
+        self._max_parts = max_parts
+        self._chunks: list[bytes] = []
+        self._header: list[bytes] = [b"", b""]
+        self._disposition: bytes = b""
+
+    def begin(self) -> None:
+        if len(self.parts) >= self._max_parts:
+            raise TooLargeError(f"more than {self._max_parts} parts.", field="body", remedy="Send at most one frame a camera.")
+        self._chunks, self._disposition = [], b""
+
+    def header_name(self, data: bytes, start: int, end: int) -> None:
+        self._header[0] += data[start:end]
+
+    def header_value(self, data: bytes, start: int, end: int) -> None:
+        self._header[1] += data[start:end]
+
+    def header_end(self) -> None:
+        if self._header[0].lower() == b"content-disposition":
+            self._disposition = self._header[1]
+        self._header = [b"", b""]
+
+    def data(self, data: bytes, start: int, end: int) -> None:
+        self._chunks.append(data[start:end])
+
+    def end(self) -> None:
+        _, options = parse_options_header(self._disposition)
+        name = options.get(b"name", b"").decode("utf-8", "replace")
+        if not name:
+            raise InputError(f"part {len(self.parts) + 1} has no name.", field="body", remedy=_FORM_REMEDY)
+        self.parts.append(Part(name, b"filename" in options, b"".join(self._chunks)))
+
+    def finish(self) -> None:
+        self.finished = True
+
+
+def _too_long(what: str, max_bytes: int) -> TooLargeError:
+    return TooLargeError(
+        f"{what}; a body may have {max_bytes}.",
+        field="body",
+        remedy="Compress the frames more, or raise QUADLIFT_MAX_BODY_BYTES.",
+    )

@@ -1,0 +1,212 @@
+"""Fusion: the boxes that several cameras lifted become one box a vehicle.
+
+Cameras join one after another; each assigns its boxes to the clusters so far in bird's-eye view. A cluster is then combined
+by information (inverse covariance), with two corrections for errors that the boxes' covariances do not know:
+
+- calibration: every camera's positions are inflated with its distance, independently of the other cameras;
+- size: all cameras run the same network on the same kind of car, so its size errors are shared and more cameras do not
+  average them away. Size therefore counts as in covariance intersection with equal weights: n cameras know it no better
+  than one of them does on average.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.association import Index, best_of_duplicates, gated_assignment, mahalanobis_cost
+from service.geometry.boxes import STATE_DIM, Boxes, box_states, project_extents
+from service.geometry.camera import Camera
+from service.geometry.transforms import Array, wrap_angle
+
+_DIMS = slice(3, 6)
+
+
+@dataclass(frozen=True, eq=False)
+class FusedBoxes:
+    """M vehicles out of N boxes of C cameras."""
+
+    boxes: Boxes
+    """M boxes, best score first."""
+    members: NDArray[np.bool_]
+    """(M, C) which cameras contributed."""
+    source: Index
+    """(N,) the row of ``boxes`` that each input box went into (duplicates: the row of the one that was kept)."""
+
+
+@dataclass(frozen=True)
+class FusionSettings:
+    """Tuning of association and fusion."""
+
+    gate: float = 9.21
+    """Largest squared Mahalanobis distance of a match: 99 % of a chi-square with 2 degrees of freedom."""
+    max_distance_m: float = 3.0
+    """Boxes farther apart are two vehicles, however vague they are: adjacent lanes stay apart."""
+    calibration_sigma_m: float = 0.05
+    """What surveying and pose leave open near the camera, metres (one sigma)."""
+    calibration_sigma_rad: float = 0.003
+    """What the camera's orientation leaves open: metres a metre of distance."""
+    duplicate_iou: float = 0.3
+    """Bird's-eye IoU above which two boxes are one vehicle: solid bodies do not overlap."""
+    duplicate_distance_m: float = 1.0
+    """Centres nearer than this are one vehicle, metres."""
+    single_view_factor: float = 0.85
+    """Score factor of a box that one camera alone reports though at least ``silent_views`` others have it in full view.
+    Mild, for another vehicle may hide it from them."""
+    silent_views: int = 2
+    """How many other cameras must be silent for that."""
+    view_range_m: float = 40.0
+    """A camera is expected to report vehicles up to this distance, metres."""
+
+
+def fuse(boxes: Boxes, camera_index: Index, cameras: Sequence[Camera], settings: FusionSettings | None = None) -> FusedBoxes:
+    """One box a vehicle from N boxes, ``camera_index`` (N,) saying which of the ``cameras`` lifted each.
+
+    Score: 1 - prod(1 - s) over the cameras that contributed (false alarms of different cameras rarely coincide), times
+    ``single_view_factor`` where cameras that should see the vehicle are silent.
+    """
+    settings = settings or FusionSettings()
+    if len(boxes) == 0:
+        return FusedBoxes(Boxes.empty(), np.zeros((0, len(cameras)), dtype=bool), np.zeros(0, np.int64))
+    keeper = best_of_duplicates(boxes, camera_index, settings.duplicate_iou, settings.duplicate_distance_m)
+    kept = np.flatnonzero(keeper == np.arange(len(boxes)))
+    single, owner = boxes.take(kept), camera_index[kept]
+    error = _calibration_covariance(single, owner, cameras, settings)
+    cluster = _cluster(single, owner, error, settings)
+    fused, members, cluster = _fuse_and_merge(single, owner, error, cluster, len(cameras), settings)
+    score = fused.score * _agreement(fused, members, cameras, settings)
+    order = np.argsort(-score, kind="stable")
+    rank = np.argsort(order)
+    position = np.zeros(len(boxes), np.int64)
+    position[kept] = np.arange(len(kept))
+    ranked = _with_score(fused, score).take(order)
+    return FusedBoxes(ranked, members[order], rank[cluster][position[keeper]])
+
+
+def _calibration_covariance(boxes: Boxes, owner: Index, cameras: Sequence[Camera], settings: FusionSettings) -> Array:
+    """Covariances (N, 7, 7) to add to the boxes for what calibration leaves open; height rests on the ground plane."""
+    origin = np.stack([camera.position_m for camera in cameras])[owner]
+    distance = np.linalg.norm(boxes.center[:, :2] - origin[:, :2], axis=1)
+    error = np.zeros((len(boxes), STATE_DIM, STATE_DIM))
+    error[:, 2, 2] = settings.calibration_sigma_m**2
+    error[:, 0, 0] = error[:, 1, 1] = error[:, 2, 2] + (settings.calibration_sigma_rad * distance) ** 2
+    return error
+
+
+def _cluster(boxes: Boxes, owner: Index, error: Array, settings: FusionSettings) -> Index:
+    """Cluster numbers (N,), 0 and up. The camera with most confidence starts; the others join one after another."""
+    xy = boxes.center[:, :2]
+    covariance = (boxes.covariance + error)[:, :2, :2]
+    information = np.linalg.inv(covariance)
+    weighted = (information @ xy[..., None])[..., 0]
+    total = np.bincount(owner, weights=boxes.score)
+    cluster = np.full(len(boxes), -1, np.int64)
+    count = 0
+    sum_information, sum_weighted = np.zeros_like(information), np.zeros_like(weighted)
+    for camera in np.argsort(-total, kind="stable"):
+        mine = np.flatnonzero(owner == camera)
+        known = np.linalg.inv(sum_information[:count])
+        known_xy = (known @ sum_weighted[:count, :, None])[..., 0]
+        distance_sq, cost, distance_m = mahalanobis_cost(xy[mine], covariance[mine], known_xy, known)
+        rows, columns = gated_assignment(distance_sq, cost, distance_m, settings.gate, settings.max_distance_m)
+        cluster[mine[rows]] = columns
+        new = mine[cluster[mine] < 0]
+        cluster[new] = count + np.arange(len(new))
+        count += len(new)
+        sum_information[cluster[mine]] += information[mine]
+        sum_weighted[cluster[mine]] += weighted[mine]
+    return cluster
+
+
+def _fuse_and_merge(
+    boxes: Boxes, owner: Index, error: Array, cluster: Index, cameras: int, settings: FusionSettings
+) -> tuple[Boxes, NDArray[np.bool_], Index]:
+    """Fused boxes, members (M, C) and clusters (N,); clusters that turn out to be one vehicle become one."""
+    while True:
+        used = _best_per_camera(boxes, owner, cluster)
+        fused = _combine(boxes.take(used), error[used], cluster[used])
+        everyone = np.zeros(len(fused), np.int64)
+        keeper = best_of_duplicates(fused, everyone, settings.duplicate_iou, settings.duplicate_distance_m)
+        survivors, renumbered = np.unique(keeper, return_inverse=True)
+        if len(survivors) == len(fused):
+            members = np.zeros((len(fused), cameras), dtype=bool)
+            members[cluster[used], owner[used]] = True
+            return fused, members, cluster
+        cluster = renumbered[cluster].astype(np.int64)
+
+
+def _best_per_camera(boxes: Boxes, owner: Index, cluster: Index) -> Index:
+    """Rows that count: of each camera's boxes in a cluster the best-scored one."""
+    order = np.lexsort((-boxes.score, owner, cluster))
+    pair = np.stack([cluster[order], owner[order]], 1)
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = np.any(pair[1:] != pair[:-1], axis=1)
+    return np.sort(order[first])
+
+
+def _combine(boxes: Boxes, error: Array, cluster: Index) -> Boxes:
+    """One box a cluster (numbered 0 .. M-1 without gaps) by information, size as in covariance intersection."""
+    count = np.bincount(cluster)
+    rows = len(count)
+    covariance = boxes.covariance + error
+    covariance[:, _DIMS, _DIMS] += (count[cluster] - 1.0)[:, None, None] * boxes.covariance[:, _DIMS, _DIMS]
+    information = np.linalg.inv(covariance)
+    axis = _circular_axis(boxes.yaw, 1.0 / covariance[:, 6, 6], cluster, rows)
+    aligned = np.cos(boxes.yaw - axis[cluster]) >= 0
+    evidence = np.bincount(cluster, np.where(aligned, 1.0, -1.0) * boxes.flip_log_odds, rows)
+    state = box_states(boxes)
+    state[:, 6] = wrap_angle(boxes.yaw - axis[cluster] + np.where(aligned, 0.0, np.pi))
+    # Relative to the cluster's first member: world coordinates may be large, differences within a cluster are not.
+    reference = np.zeros((rows, STATE_DIM))
+    reference[cluster[::-1], :3] = state[::-1, :3]
+    state -= reference[cluster]
+    sum_information = np.zeros((rows, STATE_DIM, STATE_DIM))
+    sum_weighted = np.zeros((rows, STATE_DIM))
+    np.add.at(sum_information, cluster, information)
+    np.add.at(sum_weighted, cluster, (information @ state[..., None])[..., 0])
+    fused_covariance = np.linalg.inv(sum_information)
+    fused = (fused_covariance @ sum_weighted[..., None])[..., 0] + reference
+    return Boxes(
+        center=fused[:, :3],
+        dims_lwh=fused[:, _DIMS],
+        yaw=wrap_angle(axis + fused[:, 6] + np.where(evidence < 0, np.pi, 0.0)),
+        score=1.0 - np.exp(np.bincount(cluster, np.log1p(-np.clip(boxes.score, 0.0, 1.0 - 1e-9)), rows)),
+        cls=_voted_class(boxes, cluster, rows),
+        covariance=0.5 * (fused_covariance + fused_covariance.transpose(0, 2, 1)),
+        flip_log_odds=np.abs(evidence),
+    )
+
+
+def _circular_axis(yaw: Array, weight: Array, cluster: Index, rows: int) -> Array:
+    """Weighted mean axes (M,) of headings (N,), which may be flipped by pi: in [-pi/2, pi/2]."""
+    sine = np.bincount(cluster, weight * np.sin(2 * yaw), rows)
+    cosine = np.bincount(cluster, weight * np.cos(2 * yaw), rows)
+    axis: Array = 0.5 * np.arctan2(sine, cosine)
+    return axis
+
+
+def _voted_class(boxes: Boxes, cluster: Index, rows: int) -> Index:
+    votes = np.zeros((rows, int(boxes.cls.max()) + 1))
+    np.add.at(votes, (cluster, boxes.cls), boxes.score)
+    winner: Index = votes.argmax(1).astype(np.int64)
+    return winner
+
+
+def _agreement(fused: Boxes, members: NDArray[np.bool_], cameras: Sequence[Camera], settings: FusionSettings) -> Array:
+    """Score factors (M,): below 1 where one camera alone reports what several others have in full view."""
+    expected = np.zeros_like(members)
+    for index, camera in enumerate(cameras):
+        extents, in_front = project_extents(camera, fused.center, fused.dims_lwh, fused.yaw)
+        inside = (extents[:, :2] >= 0).all(1) & (extents[:, 2:] <= [camera.width - 1, camera.height - 1]).all(1)
+        near = np.linalg.norm(fused.center - camera.position_m, axis=1) <= settings.view_range_m
+        expected[:, index] = in_front & inside & near
+    silent = (expected & ~members).sum(1)
+    alone = (members.sum(1) == 1) & (silent >= settings.silent_views)
+    return np.where(alone, settings.single_view_factor, 1.0)
+
+
+def _with_score(boxes: Boxes, score: Array) -> Boxes:
+    return Boxes(boxes.center, boxes.dims_lwh, boxes.yaw, score, boxes.cls, boxes.covariance, boxes.flip_log_odds)

@@ -1,0 +1,277 @@
+"""Lifting: a 2D box, a size, a yaw (and a depth) become a 3D box with its covariance.
+
+Maximum a posteriori over (x, y, z, l, w, h, yaw) by Levenberg and Marquardt's damped Gauss-Newton, all boxes of a frame set
+at once. The terms stand in :mod:`service.residuals`. The inverse Hessian at the solution is the box's covariance: as honest
+as the sigmas that came in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.geometry.boxes import STATE_DIM, Boxes, box_corners
+from service.geometry.camera import MIN_DEPTH_M, Camera
+from service.geometry.ground import GroundPlane
+from service.geometry.transforms import Array, transform_points, wrap_angle
+from service.residuals import DEPTH, EDGES, ROWS, BoxProblem, NormalEquations, normal_equations
+
+_MIN_DIM_M, _MAX_DIM_M = 0.2, 60.0
+_MIN_SIGMA_PX, _MIN_SIGMA_M, _MIN_SIGMA_RAD = 0.25, 0.01, 0.005
+_MAX_SIGMA_PX, _MAX_SIGMA_M, _MAX_SIGMA_RAD = 1e3, 30.0, np.pi
+_MIN_DEPTH_SIGMA_M, _MAX_DEPTH_M = 0.05, 1000.0
+_CONDITION_FLOOR = 1e-9
+_MIN_START_DEPTH_M = 1.0
+_LENS_PASSES = 2
+_MAX_LENS_MISS = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """What the networks say about the N detections of one frame set, all cameras together."""
+
+    camera_index: NDArray[np.int64]
+    """(N,) into the list of cameras."""
+    xyxy_px: Array
+    """(N, 4) 2D boxes in the pixels of ``cameras[camera_index]``."""
+    sigma_px: Array
+    """(N, 4) standard deviations of the four edges, px."""
+    dims_lwh: Array
+    """(N, 3) length, width, height, metres."""
+    sigma_dims: Array
+    """(N, 3) their standard deviations, metres."""
+    yaw: Array
+    """(N,) world yaw, radians."""
+    sigma_yaw: Array
+    """(N,) its standard deviation, radians."""
+    flip_log_odds: Array
+    """(N,) log-odds that the heading is ``yaw`` rather than ``yaw + pi``; passed on."""
+    score: Array
+    """(N,) in 0..1; passed on."""
+    cls: NDArray[np.int64]
+    """(N,) class indices; passed on."""
+    depth_m: Array
+    """(N,) depth of the visible surface along the optical axis, metres; NaN or not positive: no reading."""
+    sigma_depth_m: Array
+    """(N,) its standard deviation, metres."""
+
+    def __len__(self) -> int:
+        return len(self.yaw)
+
+
+@dataclass(frozen=True)
+class LiftSettings:
+    """Tuning of the lift; the defaults are those of the measured table in the docs."""
+
+    ground_sigma_m: float = 0.05
+    """How far a wheel may stand above or below the ground plane, metres (one sigma)."""
+    ground_sigma_per_m: float = 0.003
+    """What a metre of distance adds to it: roads are not planes, poses not exact."""
+    border_px: float = 2.0
+    """An edge this near to the image border is taken as cut by it."""
+    huber_sigmas: float = 2.0
+    """Edges and depths off by more than this count linearly: occlusion, a depth read off another object."""
+    start_sigma_m: float = 50.0
+    """Weak pull to the start position; it only keeps boxes finite whose edges are all cut."""
+    max_start_depth_m: float = 200.0
+    """Starts farther than this (rays near the horizon) are taken from the size instead."""
+    iterations: int = 6
+    """Most solver steps; boxes that have converged stand still before that."""
+    step_tolerance: float = 0.05
+    """A box has converged when its step is below this share of its own sigmas."""
+
+
+def lift(
+    cameras: Sequence[Camera], ground: GroundPlane, measurements: Measurements, settings: LiftSettings | None = None
+) -> Boxes:
+    """Boxes in the world, one a detection and in their order.
+
+    Finite for any finite input; what cannot be known (all edges cut, box above the horizon) shows in the covariance. A box
+    does not depend on the others in the batch.
+    """
+    if len(measurements) == 0:
+        return Boxes.empty()
+    settings = settings or LiftSettings()
+    xyxy, hinged = _visible_edges(cameras, measurements, settings)
+    problem = _problem(cameras, ground, measurements, xyxy, hinged, settings)
+    state, equations = _solve(problem, problem.prior, settings)
+    for _ in range(_LENS_PASSES if any(camera.has_distortion for camera in cameras) else 0):
+        problem = replace(problem, edges=_straightened(cameras, measurements.camera_index, xyxy, state, problem))
+        state, equations = _solve(problem, state, settings)
+    return Boxes(
+        center=state[:, :3],
+        dims_lwh=state[:, 3:6],
+        yaw=wrap_angle(state[:, 6]),
+        score=np.asarray(measurements.score, dtype=np.float64),
+        cls=measurements.cls,
+        covariance=_covariance(equations.hessian),
+        flip_log_odds=np.asarray(measurements.flip_log_odds, dtype=np.float64),
+    )
+
+
+def _visible_edges(cameras: Sequence[Camera], m: Measurements, settings: LiftSettings) -> tuple[Array, NDArray[np.bool_]]:
+    """2D boxes (N, 4) clipped to their images, px, and which of their edges (N, 4) the border cuts."""
+    border = np.array([[camera.width - 1.0, camera.height - 1.0] for camera in cameras])[m.camera_index]
+    first, second = np.clip(m.xyxy_px[:, :2], 0.0, border), np.clip(m.xyxy_px[:, 2:], 0.0, border)
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    hinged = np.concatenate([low <= settings.border_px, high >= border - settings.border_px], 1)
+    return np.concatenate([low, high], 1), hinged
+
+
+def _problem(
+    cameras: Sequence[Camera],
+    ground: GroundPlane,
+    m: Measurements,
+    xyxy: Array,
+    hinged: NDArray[np.bool_],
+    settings: LiftSettings,
+) -> BoxProblem:
+    """The measurements normalised and whitened, with a start for every box."""
+    index = m.camera_index
+    T = np.stack([camera.T_cam_world for camera in cameras])[index]
+    origin = np.stack([camera.position_m for camera in cameras])[index]
+    focal = np.stack([camera.K[[0, 1, 0, 1], [0, 1, 0, 1]] for camera in cameras])[index]
+    points = _normalised(cameras, index, _middles(xyxy))
+    rays = np.concatenate([points, np.ones_like(points[..., :1])], -1) @ T[:, :3, :3]
+    edges = _edge_coordinates(points)
+    dims = np.clip(m.dims_lwh, _MIN_DIM_M, _MAX_DIM_M)
+    start, start_depth = _start(ground, origin, rays, edges, dims, m.yaw, settings)
+    sigma_ground = settings.ground_sigma_m + settings.ground_sigma_per_m * start_depth
+    depth, depth_weight = _depth_readings(m)
+    prior_sigma = [
+        np.full((len(m), 3), settings.start_sigma_m),
+        np.clip(m.sigma_dims, _MIN_SIGMA_M, _MAX_SIGMA_M),
+        np.clip(m.sigma_yaw, _MIN_SIGMA_RAD, _MAX_SIGMA_RAD)[:, None],
+    ]
+    huber = np.full(ROWS, np.inf)
+    huber[EDGES] = huber[DEPTH] = settings.huber_sigmas
+    return BoxProblem(
+        R=T[:, :3, :3],
+        t=T[:, :3, 3],
+        origin=origin,
+        edges=edges,
+        edge_weight=focal / np.clip(m.sigma_px, _MIN_SIGMA_PX, _MAX_SIGMA_PX),
+        hinged=hinged,
+        prior=np.concatenate([start, dims, wrap_angle(m.yaw)[:, None]], 1),
+        prior_weight=1.0 / np.concatenate(prior_sigma, 1),
+        ground_normal=ground.normal,
+        ground_offset=ground.offset,
+        ground_weight=1.0 / sigma_ground,
+        ray=rays[:, 4],
+        depth=depth,
+        depth_weight=depth_weight,
+        huber=huber,
+    )
+
+
+def _depth_readings(m: Measurements) -> tuple[Array, Array]:
+    """Depths (N,), metres, and their weights (N,): 0 where there is no reading, or none that can be a depth."""
+    usable = np.isfinite(m.sigma_depth_m) & (m.depth_m > 0) & (m.depth_m < _MAX_DEPTH_M)
+    sigma = np.clip(np.where(usable, m.sigma_depth_m, 1.0), _MIN_DEPTH_SIGMA_M, _MAX_DEPTH_M)
+    return np.where(usable, m.depth_m, 0.0), np.where(usable, 1.0 / sigma, 0.0)
+
+
+def _middles(xyxy: Array) -> Array:
+    """Middles of the left, top, right and bottom edges and the centre (N, 5, 2) of 2D boxes (N, 4), px."""
+    left, top, right, bottom = xyxy.T
+    x, y = 0.5 * (left + right), 0.5 * (top + bottom)
+    return np.stack([np.stack(p, -1) for p in ((left, y), (x, top), (right, y), (x, bottom), (x, y))], 1)
+
+
+def _normalised(cameras: Sequence[Camera], index: NDArray[np.int64], pixels: Array) -> Array:
+    """Undistorted normalised points of pixels (N, P, 2) in the cameras ``index`` (N,)."""
+    points = np.empty_like(pixels)
+    for number in np.unique(index):
+        mine = index == number
+        points[mine] = cameras[number].normalised_from_pixels(pixels[mine])
+    return points
+
+
+def _edge_coordinates(points: Array) -> Array:
+    """Left, top, right, bottom (N, 4) from one point on each edge, (N, 4 or more, 2)."""
+    return np.stack([points[:, 0, 0], points[:, 1, 1], points[:, 2, 0], points[:, 3, 1]], 1)
+
+
+def _straightened(cameras: Sequence[Camera], index: NDArray[np.int64], xyxy: Array, state: Array, problem: BoxProblem) -> Array:
+    """Edges (N, 4) for a pinhole that miss the boxes at ``state`` by as much as the 2D boxes do through the real lens.
+
+    A lens bends straight edges, so an edge's middle undistorted is not where the box touches it; misses are.
+    """
+    edges = problem.edges.copy()
+    for number in np.unique(index):
+        mine = np.flatnonzero(index == number)
+        camera = cameras[number]
+        corners = transform_points(camera.T_cam_world, box_corners(state[mine, :3], state[mine, 3:6], state[mine, 6]))
+        image = corners[..., :2] / np.maximum(corners[..., 2:], MIN_DEPTH_M)
+        pixels = camera.pixels_from_normalised(image)
+        miss = xyxy[mine] - np.concatenate([pixels.min(1), pixels.max(1)], 1)
+        focal = camera.K[[0, 1, 0, 1], [0, 1, 0, 1]]
+        straight = np.concatenate([image.min(1), image.max(1)], 1) + miss / focal
+        # Far from its edge, or past the border, a box may lie where the lens model means nothing.
+        trusted = ~problem.hinged[mine] & (np.abs(miss) < _MAX_LENS_MISS * focal)
+        edges[mine] = np.where(trusted, straight, edges[mine])
+    return edges
+
+
+def _start(
+    ground: GroundPlane, origin: Array, rays: Array, edges: Array, dims: Array, yaw: Array, settings: LiftSettings
+) -> tuple[Array, Array]:
+    """Start centres (N, 3) and their depths (N,): the bottom edge on the ground, else the size at the seen height."""
+    down = rays[:, 3]
+    descent = down @ ground.normal
+    height = origin @ ground.normal - ground.offset
+    with np.errstate(divide="ignore", invalid="ignore"):
+        on_ground = -height / descent
+        by_size = dims[:, 2] / (edges[:, 3] - edges[:, 1])
+    limit = settings.max_start_depth_m
+    by_size = np.clip(np.nan_to_num(by_size, nan=limit, posinf=limit), _MIN_START_DEPTH_M, limit)
+    usable = np.isfinite(on_ground) & (on_ground > _MIN_START_DEPTH_M) & (on_ground < limit)
+    contact = origin + down * np.where(usable, on_ground, 0.0)[:, None]
+    # The bottom edge belongs to the nearest part of the box: its centre lies half a footprint farther on.
+    azimuth = np.arctan2(down[:, 1], down[:, 0])
+    reach = 0.5 * (dims[:, 0] * np.abs(np.cos(yaw - azimuth)) + dims[:, 1] * np.abs(np.sin(yaw - azimuth)))
+    offset = np.stack([reach * np.cos(azimuth), reach * np.sin(azimuth), 0.5 * dims[:, 2]], 1)
+    start = np.where(usable[:, None], contact + offset, origin + rays[:, 4] * by_size[:, None])
+    return start, np.where(usable, on_ground, by_size)
+
+
+def _solve(problem: BoxProblem, start: Array, settings: LiftSettings) -> tuple[Array, NormalEquations]:
+    """Damped Gauss-Newton on every box at once; each box has its own damping and stops by itself."""
+    state = start.copy()
+    now = normal_equations(problem, state)
+    damping = np.full(len(state), 1e-3)
+    moving = np.ones(len(state), dtype=bool)
+    diagonal = np.arange(STATE_DIM)
+    for _ in range(settings.iterations):
+        scale = now.hessian[:, diagonal, diagonal]
+        damped = now.hessian.copy()
+        damped[:, diagonal, diagonal] += damping[:, None] * scale
+        step = np.linalg.solve(damped, -now.gradient[..., None])[..., 0]
+        trial = state + step
+        trial[:, 3:6] = np.clip(trial[:, 3:6], _MIN_DIM_M, _MAX_DIM_M)
+        then = normal_equations(problem, trial)
+        better = moving & (then.cost <= now.cost)
+        state = np.where(better[:, None], trial, state)
+        now = NormalEquations(
+            np.where(better, then.cost, now.cost),
+            np.where(better[:, None], then.gradient, now.gradient),
+            np.where(better[:, None, None], then.hessian, now.hessian),
+        )
+        damping = np.clip(np.where(better, 0.2 * damping, 10.0 * damping), 1e-6, 1e6)
+        moving &= ~(better & (np.abs(step) * np.sqrt(scale) < settings.step_tolerance).all(1))
+        if not moving.any():
+            break
+    return state, now
+
+
+def _covariance(hessian: Array) -> Array:
+    """Inverse Hessians (N, 7, 7), symmetric and positive definite."""
+    # Scaled to a unit diagonal first: metres, radians and far boxes otherwise differ by many orders of magnitude.
+    scale = 1.0 / np.sqrt(np.diagonal(hessian, axis1=1, axis2=2))
+    outer = scale[:, :, None] * scale[:, None, :]
+    inverse = np.linalg.inv(hessian * outer + _CONDITION_FLOOR * np.eye(STATE_DIM)) * outer
+    symmetric: Array = 0.5 * (inverse + inverse.transpose(0, 2, 1))
+    return symmetric

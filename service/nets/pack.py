@@ -1,0 +1,164 @@
+"""A pack: a folder of ONNX networks with a ``manifest.json``, checked before anything of it runs.
+
+A network's normalisation lies inside its graph; sizes and priors lie in its ONNX metadata under the key ``quadlift`` as
+JSON. So the ONNX file and its SHA-256 in the manifest are all that a pack is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from service.errors import PackError
+
+MODELS_DIR = Path(__file__).resolve().parent.parent / "models"
+METADATA_KEY = "quadlift"
+REQUIRED_NETWORKS = ("detector", "multibin", "depth")
+# A tensor stored outside the file carries a StringStringEntryProto whose key is "location": field 1, 8 bytes.
+_EXTERNAL_DATA_MARK = b"\x0a\x08location"
+
+
+class NetworkEntry(BaseModel):
+    """One network of a pack."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    file: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*\.onnx$")]
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    precision: str
+    """fp32, fp16 or int8."""
+    parameters: Annotated[int, Field(ge=0)]
+
+
+class Manifest(BaseModel):
+    """The form of ``manifest.json``."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: str
+    version: str
+    licence: str
+    classes: Annotated[list[str], Field(min_length=1)]
+    networks: dict[str, NetworkEntry]
+    training: dict[str, Any]
+    """Data, seeds and configuration that the weights come from."""
+    scores: dict[str, Any]
+    """Validation scores of the networks, by network."""
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """One ONNX Runtime session and the metadata of its file. Safe to run from several threads at once."""
+
+    name: str
+    session: ort.InferenceSession
+    metadata: dict[str, Any]
+
+    def run(self, batch: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
+        """All outputs, in the graph's order, for one input batch."""
+        outputs: list[NDArray[np.float32]] = self.session.run(None, {self.session.get_inputs()[0].name: batch})
+        return outputs
+
+
+@dataclass(frozen=True, eq=False)
+class Pack:
+    """A loaded pack."""
+
+    path: Path
+    manifest: Manifest
+    networks: dict[str, Network]
+
+
+def resolve_pack(name_or_path: str) -> Path:
+    """The folder of a shipped pack by name, or of any pack by path. Raises PackError when there is none."""
+    for folder in (MODELS_DIR / name_or_path, Path(name_or_path)):
+        if (folder / "manifest.json").is_file():
+            return folder
+    shipped = ", ".join(sorted(p.parent.name for p in MODELS_DIR.glob("*/manifest.json"))) or "none"
+    raise PackError(
+        f"no manifest.json in '{name_or_path}'.",
+        field="pack",
+        remedy=f"Give a folder that holds one, or the name of a shipped pack ({shipped}).",
+    )
+
+
+def load_pack(name_or_path: str, *, intra_op_threads: int = 1) -> Pack:
+    """Check and load a pack.
+
+    intra_op_threads: threads that one network run may use. With one, every thread that calls ``run`` works on its own,
+    and workers scale with cores.
+
+    Raises PackError when the manifest is malformed, or a file is missing, altered, or keeps tensors outside itself.
+    """
+    folder = resolve_pack(name_or_path)
+    manifest = _read_manifest(folder / "manifest.json")
+    for name in REQUIRED_NETWORKS:
+        if name not in manifest.networks:
+            raise PackError(f"no network '{name}'.", field=f"{folder.name}/manifest.json", remedy="Export the pack again.")
+    networks = {name: _load_network(folder, name, entry, intra_op_threads) for name, entry in manifest.networks.items()}
+    return Pack(folder, manifest, networks)
+
+
+def session_options(intra_op_threads: int) -> ort.SessionOptions:
+    """Options for the service: threads set, and no spinning, which starves the other workers of a small machine."""
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = intra_op_threads
+    options.inter_op_num_threads = 1
+    options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.log_severity_level = 3
+    return options
+
+
+def open_network(name: str, model: bytes, intra_op_threads: int = 1) -> Network:
+    """A network from the bytes of an ONNX file. Raises PackError when it is no self-contained Quadlift network."""
+    if _EXTERNAL_DATA_MARK in model:
+        raise PackError(
+            "the file keeps tensors outside itself (external data).",
+            field=name,
+            remedy="Save the model as one file; a pack vouches for every byte that it loads.",
+        )
+    try:
+        session = ort.InferenceSession(model, session_options(intra_op_threads), providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime raises a dozen unrelated types
+        raise PackError(f"ONNX Runtime cannot load it: {error}", field=name, remedy="Export the pack again.") from error
+    try:
+        metadata = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
+    except (KeyError, json.JSONDecodeError) as error:
+        raise PackError(
+            f"no '{METADATA_KEY}' metadata.", field=name, remedy="Export the network with `quadlift export`."
+        ) from error
+    return Network(name, session, metadata)
+
+
+def _read_manifest(path: Path) -> Manifest:
+    try:
+        return Manifest.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise PackError(f"{where}: {first['msg']}.", field=str(path), remedy="Export the pack again.") from None
+
+
+def _load_network(folder: Path, name: str, entry: NetworkEntry, intra_op_threads: int) -> Network:
+    path = folder / entry.file
+    try:
+        model = path.read_bytes()
+    except OSError as error:
+        raise PackError(f"cannot be read: {error}.", field=str(path), remedy="Install or export the pack again.") from error
+    digest = hashlib.sha256(model).hexdigest()
+    if digest != entry.sha256:
+        raise PackError(
+            f"SHA-256 is {digest}, the manifest says {entry.sha256}.",
+            field=str(path),
+            remedy="The file was altered or damaged: install or export the pack again.",
+        )
+    return open_network(name, model, intra_op_threads)

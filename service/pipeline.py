@@ -1,0 +1,177 @@
+"""One frame set's way through the house: decode, detect, orient, depth, lift, fuse. Knows no HTTP, times each step."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.depth_scale import DepthReadings, DepthScales, read_boxes
+from service.errors import FrameError
+from service.frames import FrameSet, decode
+from service.fusion import FusionSettings, fuse
+from service.geometry.boxes import Boxes, clip_extents
+from service.geometry.camera import Camera, UInt8Image, yaw_from_alpha
+from service.lifting import LiftSettings, Measurements, lift
+from service.nets.canvas import canvas_size
+from service.nets.depth import DepthNet
+from service.nets.detector import Detections, Detector, edge_sigma
+from service.nets.multibin import Multibin, MultibinEstimates, crop_vehicles
+from service.nets.pack import Pack
+
+
+@dataclass(frozen=True)
+class PipelineSettings:
+    """What can be set of the pipeline; the rest comes from the pack and the site."""
+
+    score_threshold: float = 0.3
+    """2D detections of a lower score are dropped."""
+    nms_iou: float = 0.55
+    """2D boxes that overlap a better one by more are dropped."""
+    min_fused_score: float = 0.3
+    """Fused boxes of a lower score are dropped."""
+    lift: LiftSettings = field(default_factory=LiftSettings)
+    fusion: FusionSettings = field(default_factory=FusionSettings)
+
+
+@dataclass(frozen=True, eq=False)
+class SetResult:
+    """What the pipeline says of one frame set."""
+
+    boxes: Boxes
+    """Fused boxes (M) in the world frame."""
+    members: NDArray[np.bool_]
+    """(M, C): which of ``camera_ids`` saw each box."""
+    camera_ids: tuple[str, ...]
+    """The C cameras whose frames were decoded."""
+    classes: tuple[str, ...]
+    """Names of the class indices."""
+    per_camera: list[Boxes]
+    """Each camera's own lifted boxes, in the order of ``camera_ids``."""
+    detections: dict[str, int]
+    """2D detections a camera."""
+    timing_ms: dict[str, float]
+    """Wall time of each step."""
+    failed: dict[str, FrameError]
+    """Cameras whose frame could not be decoded."""
+
+
+class Pipeline:
+    """The steps, composed over one pack. Safe to run from several threads at once."""
+
+    def __init__(self, pack: Pack, settings: PipelineSettings | None = None) -> None:
+        self.settings = settings or PipelineSettings()
+        self.classes = tuple(pack.manifest.classes)
+        self.detector = Detector(pack.networks["detector"])
+        self.multibin = Multibin(pack.networks["multibin"])
+        self.depth = DepthNet(pack.networks["depth"])
+        self._scales = DepthScales()
+
+    def warm_up(self) -> None:
+        """Run every network once at the paper's frame size, so that the first request pays no set-up."""
+        width, height = canvas_size(self.detector.spec.max_width, 192)
+        images = [np.full((height, width, 3), 114, np.uint8)] * 4
+        self.detector.detect(images)
+        self.depth.infer(images)
+        self.multibin.estimate(
+            crop_vehicles(images[0], [[0.0, 0.0, 20.0, 20.0]], self.multibin.spec.crop_px), np.zeros(1, np.int64)
+        )
+
+    def run(self, frame_set: FrameSet) -> SetResult:
+        """All steps for one set. Raises the first FrameError when not one frame can be decoded."""
+        timing: dict[str, float] = {}
+        started = time.perf_counter()
+        with _timed(timing, "decode"):
+            cameras, images, failed = self._decode(frame_set)
+        with _timed(timing, "detect"):
+            found = self.detector.detect(images, score_threshold=self.settings.score_threshold, nms_iou=self.settings.nms_iou)
+        with _timed(timing, "orient"):
+            estimates = self._orient(images, found)
+        with _timed(timing, "depth"):
+            readings = self._read_depth(frame_set, cameras, images, found)
+        with _timed(timing, "lift"):
+            measurements = self._measurements(cameras, found, estimates, readings)
+            lifted = lift(cameras, frame_set.site.ground, measurements, self.settings.lift)
+        with _timed(timing, "fuse"):
+            fused = fuse(lifted, measurements.camera_index, cameras, self.settings.fusion)
+            keep = fused.boxes.score >= self.settings.min_fused_score
+        timing["total"] = 1e3 * (time.perf_counter() - started)
+        return SetResult(
+            boxes=fused.boxes.take(keep),
+            members=fused.members[keep],
+            camera_ids=tuple(camera.id for camera in cameras),
+            classes=self.classes,
+            per_camera=[lifted.take(measurements.camera_index == index) for index in range(len(cameras))],
+            detections={camera.id: len(detections) for camera, detections in zip(cameras, found, strict=True)},
+            timing_ms=timing,
+            failed=failed,
+        )
+
+    def _decode(self, frame_set: FrameSet) -> tuple[list[Camera], list[UInt8Image], dict[str, FrameError]]:
+        """Images, and the cameras at the images' sizes."""
+        cameras, images, failed = [], [], {}
+        for frame in frame_set.frames:
+            camera = frame_set.site.camera(frame.camera_id)
+            try:
+                image = decode(frame.data, camera, self.detector.spec.max_width)
+            except FrameError as error:
+                failed[camera.id] = error
+                continue
+            images.append(image)
+            cameras.append(camera.scaled(image.shape[1], image.shape[0]))
+        if failed and not images:
+            raise next(iter(failed.values()))
+        return cameras, images, failed
+
+    def _orient(self, images: list[UInt8Image], found: list[Detections]) -> MultibinEstimates:
+        size = self.multibin.spec.crop_px
+        crops = [crop_vehicles(image, detections.xyxy_px, size) for image, detections in zip(images, found, strict=True)]
+        return self.multibin.estimate(np.concatenate(crops), np.concatenate([detections.cls for detections in found]))
+
+    def _read_depth(
+        self, frame_set: FrameSet, cameras: list[Camera], images: list[UInt8Image], found: list[Detections]
+    ) -> DepthReadings:
+        parts = []
+        for camera, inverse, detections in zip(cameras, self.depth.infer(images), found, strict=True):
+            scale = self._scales.update(frame_set.site.camera(camera.id), camera, frame_set.site.ground, inverse)
+            parts.append(read_boxes(inverse, scale, detections.xyxy_px, self.depth.sigma_relative))
+        return DepthReadings(np.concatenate([p.depth_m for p in parts]), np.concatenate([p.sigma_m for p in parts]))
+
+    def _measurements(
+        self, cameras: list[Camera], found: list[Detections], estimates: MultibinEstimates, readings: DepthReadings
+    ) -> Measurements:
+        index = np.repeat(np.arange(len(cameras)), [len(detections) for detections in found])
+        xyxy = np.concatenate([clip_extents(camera, d.xyxy_px) for camera, d in zip(cameras, found, strict=True)])
+        centers = (xyxy[:, :2] + xyxy[:, 2:]) / 2
+        yaw = np.zeros(len(index))
+        for row, camera in enumerate(cameras):
+            own = index == row
+            yaw[own] = yaw_from_alpha(camera, estimates.alpha[own], centers[own])
+        spec = self.multibin.spec
+        return Measurements(
+            camera_index=index,
+            xyxy_px=xyxy,
+            sigma_px=edge_sigma(self.detector.spec, xyxy),
+            dims_lwh=estimates.dims_lwh,
+            sigma_dims=np.tile(spec.sigma_dims_lwh, (len(index), 1)),
+            yaw=yaw,
+            sigma_yaw=np.full(len(index), spec.sigma_alpha_rad),
+            flip_log_odds=estimates.flip_log_odds,
+            score=np.concatenate([d.score for d in found]),
+            cls=np.concatenate([d.cls for d in found]),
+            depth_m=readings.depth_m,
+            sigma_depth_m=readings.sigma_m,
+        )
+
+
+@contextmanager
+def _timed(timing: dict[str, float], step: str) -> Iterator[None]:
+    started = time.perf_counter()
+    try:
+        yield
+    finally:
+        timing[step] = 1e3 * (time.perf_counter() - started)

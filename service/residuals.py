@@ -1,0 +1,174 @@
+"""What a lifted box must satisfy: residuals with analytic Jacobians, for N boxes at once (docs: lifting).
+
+State (N, 7): x y z l w h yaw, world frame. Everything is whitened, so a residual of 1 is one sigma. The image is handled in
+undistorted normalised coordinates (x/z, y/z); distances there are pixels over the focal length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.geometry.boxes import CORNER_SIGNS, STATE_DIM
+from service.geometry.camera import MIN_DEPTH_M
+from service.geometry.transforms import Array, wrap_angle
+
+EDGES, GROUND, DEPTH = slice(0, 4), 4, 5
+"""Rows of the residual: left, top, right, bottom; bottom face on the ground; visible surface at the read depth."""
+
+ROWS = 6
+_EDGE_AXIS = np.array([0, 1, 0, 1])
+_FAR_PARALLEL = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class BoxProblem:
+    """The measurements of N boxes, whitened and gathered a box at a time."""
+
+    R: Array
+    """(N, 3, 3) rotation world to camera."""
+    t: Array
+    """(N, 3) translation world to camera, metres."""
+    origin: Array
+    """(N, 3) camera centre, world."""
+    edges: Array
+    """(N, 4) left, top, right, bottom of the 2D boxes, normalised coordinates."""
+    edge_weight: Array
+    """(N, 4) 1 / sigma of the edges."""
+    hinged: NDArray[np.bool_]
+    """(N, 4) edges cut by the image border: the box must reach them and may go past."""
+    prior: Array
+    """(N, 7) start position, predicted size, predicted yaw."""
+    prior_weight: Array
+    """(N, 7) 1 / sigma of the prior."""
+    ground_normal: Array
+    """(3,) unit normal of the ground plane, world."""
+    ground_offset: float
+    """Offset of the ground plane, metres."""
+    ground_weight: Array
+    """(N,) 1 / sigma, 1/m."""
+    ray: Array
+    """(N, 3) viewing ray through the 2D box's centre, world, of depth 1 along the optical axis."""
+    depth: Array
+    """(N,) depth of the visible surface along the optical axis, metres; any number where the weight is 0."""
+    depth_weight: Array
+    """(N,) 1 / sigma, 1/m; 0 where there is no reading."""
+    huber: Array
+    """(6,) residual (sigmas) from which a row counts linearly."""
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """Cost (N,), gradient (N, 7) and Gauss-Newton Hessian (N, 7, 7) of N boxes."""
+
+    cost: Array
+    gradient: Array
+    hessian: Array
+
+
+def box_axes(yaw: Array) -> Array:
+    """World directions (N, 3, 3) of the boxes' length, width and height, one a row."""
+    axes = np.zeros((len(yaw), 3, 3))
+    axes[:, 0, 0] = axes[:, 1, 1] = np.cos(yaw)
+    axes[:, 0, 1] = np.sin(yaw)
+    axes[:, 1, 0] = -axes[:, 0, 1]
+    axes[:, 2, 2] = 1.0
+    return axes
+
+
+def normal_equations(problem: BoxProblem, state: Array) -> NormalEquations:
+    """Cost, gradient and Hessian at states (N, 7): Huber on the rows, squares on the prior."""
+    residual, jacobian = residuals(problem, state)
+    magnitude = np.abs(residual)
+    inner = np.minimum(magnitude, problem.huber)
+    robust = np.divide(inner, magnitude, out=np.ones_like(inner), where=magnitude > 0)
+    offset = state - problem.prior
+    offset[:, 6] = wrap_angle(offset[:, 6])
+    pull = offset * problem.prior_weight**2
+    weighted_t = (jacobian * robust[..., None]).transpose(0, 2, 1)
+    hessian = weighted_t @ jacobian
+    diagonal = np.arange(STATE_DIM)
+    hessian[:, diagonal, diagonal] += problem.prior_weight**2
+    gradient = (weighted_t @ residual[..., None])[..., 0] + pull
+    cost = (inner * (magnitude - 0.5 * inner)).sum(1) + 0.5 * (offset * pull).sum(1)
+    return NormalEquations(cost, gradient, hessian)
+
+
+def residuals(problem: BoxProblem, state: Array) -> tuple[Array, Array]:
+    """Whitened residuals (N, 6) and Jacobians (N, 6, 7) of everything but the prior, at states (N, 7)."""
+    residual = np.empty((len(state), ROWS))
+    jacobian = np.zeros((len(state), ROWS, STATE_DIM))
+    axes = box_axes(state[:, 6])
+    _edge_rows(problem, state, axes, residual, jacobian)
+    _ground_row(problem, state, residual, jacobian)
+    if np.any(problem.depth_weight):
+        _depth_row(problem, state, axes, residual, jacobian)
+    else:
+        residual[:, DEPTH] = 0.0
+    return residual, jacobian
+
+
+def _edge_rows(problem: BoxProblem, state: Array, axes: Array, residual: Array, jacobian: Array) -> None:
+    """Each edge against the corner that makes it at this state (the active corner)."""
+    half = 0.5 * state[:, 3:6]
+    center_cam = (problem.R @ state[:, :3, None])[..., 0] + problem.t
+    half_axes_cam = (axes * half[..., None]) @ problem.R.transpose(0, 2, 1)
+    corners = center_cam[:, None] + CORNER_SIGNS @ half_axes_cam
+    depth = np.maximum(corners[..., 2:], MIN_DEPTH_M)
+    image = corners[..., :2] / depth
+    active = np.concatenate([image.argmin(1), image.argmax(1)], 1)
+    rows = np.arange(len(state))[:, None]
+    seen = image[rows, active, _EDGE_AXIS]
+    # The image coordinate's gradient over the corner's world position, then chained through size and yaw.
+    over_corner = (problem.R[:, _EDGE_AXIS] - seen[..., None] * problem.R[:, 2:]) / depth[rows, active]
+    over_axes = over_corner @ axes.transpose(0, 2, 1)
+    signs = CORNER_SIGNS[active]
+    miss = seen - problem.edges
+    # A cut edge is content when the box goes past it: below it at the left and top, above it at the right and bottom.
+    past = np.concatenate([miss[:, :2] < 0, miss[:, 2:] > 0], 1)
+    weight = np.where(problem.hinged & past, 0.0, problem.edge_weight)
+    residual[:, EDGES] = miss * weight
+    jacobian[:, EDGES, :3] = over_corner
+    jacobian[:, EDGES, 3:6] = 0.5 * signs * over_axes
+    reach = signs * half[:, None]
+    jacobian[:, EDGES, 6] = reach[..., 0] * over_axes[..., 1] - reach[..., 1] * over_axes[..., 0]
+    jacobian[:, EDGES] *= weight[..., None]
+
+
+def _ground_row(problem: BoxProblem, state: Array, residual: Array, jacobian: Array) -> None:
+    """Centre of the bottom face on the ground plane."""
+    normal = problem.ground_normal
+    gap = state[:, :3] @ normal - 0.5 * normal[2] * state[:, 5] - problem.ground_offset
+    residual[:, GROUND] = gap * problem.ground_weight
+    jacobian[:, GROUND, :3] = normal * problem.ground_weight[:, None]
+    jacobian[:, GROUND, 5] = -0.5 * normal[2] * problem.ground_weight
+
+
+def _depth_row(problem: BoxProblem, state: Array, axes: Array, residual: Array, jacobian: Array) -> None:
+    """Depth at which the ray through the 2D box's centre enters the 3D box; of the box's centre if the ray misses it."""
+    rows = np.arange(len(state))
+    half = 0.5 * state[:, 3:6]
+    to_center = state[:, :3] - problem.origin
+    along = (axes @ problem.ray[..., None])[..., 0]
+    parallel = np.abs(along) < _FAR_PARALLEL
+    speed = np.where(parallel, 1.0, along)
+    facing = np.sign(speed)
+    to_center_box = (axes @ to_center[..., None])[..., 0]
+    enter = np.where(parallel, -np.inf, (to_center_box - facing * half) / speed)
+    leave = np.where(parallel, np.inf, (to_center_box + facing * half) / speed)
+    face = enter.argmax(1)
+    first = enter[rows, face]
+    hit = (first <= leave.min(1)) & (first > 0)
+    normal, rate = axes[rows, face], speed[rows, face]
+    # d(normal)/d(yaw): the length axis turns into the width axis, that one into the opposite of the length axis.
+    turned = np.stack([axes[:, 1], -axes[:, 0], np.zeros_like(axes[:, 0])], 1)[rows, face]
+    over_center = np.where(hit[:, None], normal / rate[:, None], problem.R[:, 2])
+    surface = np.where(hit, first, (problem.R[:, 2] * to_center).sum(1))
+    over_yaw = (turned * (to_center - first[:, None] * problem.ray)).sum(1) / rate
+    weight = problem.depth_weight
+    residual[:, DEPTH] = np.where(weight > 0, (surface - problem.depth) * weight, 0.0)
+    jacobian[:, DEPTH, :3] = over_center * weight[:, None]
+    jacobian[rows, DEPTH, 3 + face] = np.where(hit, -0.5 * facing[rows, face] / rate, 0.0) * weight
+    jacobian[:, DEPTH, 6] = np.where(hit, over_yaw, 0.0) * weight

@@ -1,0 +1,88 @@
+"""Every knob of the service, in one place: named, typed, and read from the environment as ``QUADLIFT_<NAME>``."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from service.frames import FrameLimits
+
+_CGROUP_CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
+
+
+def usable_cores(cpu_max: Path = _CGROUP_CPU_MAX) -> int:
+    """Cores that this process may really use: its CPU affinity, and a container's quota if that is smaller; at least 1."""
+    affinity = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    try:
+        quota, period = cpu_max.read_text("ascii").split()
+    except (OSError, ValueError):
+        # No cgroup v2 here, so nothing limits the process but its affinity.
+        return affinity
+    if quota == "max":
+        return affinity
+    return max(1, min(affinity, int(quota) // int(period)))
+
+
+class Settings(BaseSettings):
+    """Settings of one service process."""
+
+    model_config = SettingsConfigDict(env_prefix="QUADLIFT_", frozen=True, use_attribute_docstrings=True)
+
+    host: str = "127.0.0.1"
+    """Address to listen on; ``0.0.0.0`` for all. The service has no log-in of its own: put a proxy before a public one."""
+    port: Annotated[int, Field(ge=0, le=65535)] = 8000
+    """TCP port to listen on; 0 takes a free one."""
+    pack: str = "edge"
+    """Networks to run: the name of a shipped pack, or the path of a pack's folder."""
+    data_dir: Path | None = None
+    """Folder that keeps the sites across restarts. Unset: sites live in memory only."""
+    sites: tuple[Path, ...] = ()
+    """Site files to load at start; each replaces a kept site of the same id."""
+
+    workers: Annotated[int, Field(ge=1, le=256)] = Field(default_factory=usable_cores)
+    """Threads that run frame sets, each with one thread inside the networks. Default: the usable cores."""
+    queue_size: Annotated[int, Field(ge=1)] = 16
+    """Frame sets that may wait for a worker; one more is answered 503."""
+    deadline_ms: Annotated[float, Field(gt=0)] = 1000.0
+    """A frame set that has waited this long for a worker is answered 503 instead of being run. Milliseconds."""
+    score_threshold: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Detections and boxes of a lower score are left out. Unset: the pipeline's own thresholds."""
+
+    max_body_bytes: Annotated[int, Field(ge=1024)] = 32 * 2**20
+    """Bytes of one request's body."""
+    max_frame_bytes: Annotated[int, Field(ge=1024)] = FrameLimits.max_frame_bytes
+    """Bytes of one frame's file."""
+    max_pixels: Annotated[int, Field(ge=256)] = FrameLimits.max_pixels
+    """Width times height of one frame; checked on its header, before it is decoded."""
+    max_cameras: Annotated[int, Field(ge=1, le=64)] = 16
+    """Cameras of one site."""
+    max_sites: Annotated[int, Field(ge=1)] = 256
+    """Sites of one service."""
+    max_readers: Annotated[int, Field(ge=1)] = 64
+    """Stream subscribers of one site."""
+
+    viewer: bool = True
+    """Serve the viewer page at ``/`` and the newest frames that it shows."""
+    viewer_max_bytes: Annotated[int, Field(ge=0)] = 64 * 2**20
+    """Bytes that the kept frames of all sites may take together; the oldest go first."""
+    tracker_reset_s: Annotated[float, Field(gt=0)] = 5.0
+    """Capture times that fall back by more than this begin a new track list (a clock was set, a recording began again);
+    a frame set that is late by less is answered without tracking. Seconds."""
+
+    timeout_keep_alive_s: Annotated[int, Field(ge=1)] = 15
+    """An idle connection is closed after this time. Seconds."""
+    timeout_shutdown_s: Annotated[int, Field(ge=0)] = 10
+    """Time for requests under way when the service is asked to stop. Seconds."""
+    limit_concurrency: Annotated[int, Field(ge=1)] = 512
+    """Connections and requests at once; one more is answered 503."""
+    ws_max_size: Annotated[int, Field(ge=1024)] = 16 * 2**20
+    """Bytes of one WebSocket message to the service."""
+
+    @property
+    def frame_limits(self) -> FrameLimits:
+        """The limits that apply to a single frame."""
+        return FrameLimits(self.max_frame_bytes, self.max_pixels)

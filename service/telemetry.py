@@ -1,0 +1,109 @@
+"""Counters and histograms of one service, in a registry of its own: two services in one process do not mix."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from enum import StrEnum
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+
+_SECONDS = (0.001, 0.002, 0.005, 0.01, 0.015, 0.02, 0.033, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+
+
+class Drop(StrEnum):
+    """Why something that was accepted, or could have been, was not delivered."""
+
+    QUEUE_FULL = "queue_full"
+    """A frame set found no place in the queue."""
+    DEADLINE = "deadline"
+    """A frame set waited too long for a worker."""
+    STOPPING = "stopping"
+    """A frame set came while the service was stopping."""
+    CANCELLED = "cancelled"
+    """A frame set's sender went away before it was run."""
+    FAILED = "failed"
+    """The networks failed on a frame set."""
+    LATE = "late"
+    """A frame set was answered, but a later one had been tracked and published already."""
+    SLOW_READER = "slow_reader"
+    """A stream message was replaced by a newer one before its reader took it."""
+    NOT_FINITE = "not_finite"
+    """A box held a number that is not finite."""
+
+
+class Telemetry:
+    """What a service counts. Safe to use from any thread."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        self._requests = Counter(
+            "quadlift_http_requests", "HTTP requests by route and status.", ["route", "status"], registry=self.registry
+        )
+        self._sets = Counter("quadlift_frame_sets", "Frame sets run to the end, by site.", ["site"], registry=self.registry)
+        self._frames = Counter("quadlift_frames", "Frames by what became of them.", ["status"], registry=self.registry)
+        self._boxes = Counter("quadlift_boxes", "Fused boxes given out, by site.", ["site"], registry=self.registry)
+        self._dropped = Counter("quadlift_dropped", "Things dropped, by reason.", ["reason"], registry=self.registry)
+        self._stages = Histogram(
+            "quadlift_stage_seconds",
+            "Time of each step for one frame set.",
+            ["stage"],
+            buckets=_SECONDS,
+            registry=self.registry,
+        )
+        self._waits = Histogram(
+            "quadlift_queue_seconds", "Time that a frame set waited for a worker.", buckets=_SECONDS, registry=self.registry
+        )
+        self._queued = Gauge("quadlift_queued_frame_sets", "Frame sets that wait for a worker.", registry=self.registry)
+        self._readers = Gauge("quadlift_stream_readers", "Stream subscribers, by site.", ["site"], registry=self.registry)
+        self._ready = Gauge("quadlift_ready", "1 when the service answers frame sets.", registry=self.registry)
+        for reason in Drop:
+            # A counter that is there from the start can be alerted on.
+            self._dropped.labels(reason.value)
+
+    def request(self, route: str, status: int) -> None:
+        """Count an answered HTTP request; ``route`` is the template, so that ids do not multiply the series."""
+        self._requests.labels(route, str(status)).inc()
+
+    def frame_set(self, site: str, statuses: Iterable[str], boxes: int, timing_ms: Mapping[str, float]) -> None:
+        """Count a frame set that was answered: its cameras' statuses, its boxes, and each step's milliseconds."""
+        self._sets.labels(site).inc()
+        self._boxes.labels(site).inc(boxes)
+        for status in statuses:
+            self._frames.labels(status).inc()
+        for stage, milliseconds in timing_ms.items():
+            self._stages.labels(stage).observe(milliseconds / 1e3)
+
+    def dropped(self, reason: Drop, count: int = 1) -> None:
+        """Count something dropped."""
+        self._dropped.labels(reason.value).inc(count)
+
+    def drops(self) -> dict[str, int]:
+        """How much was dropped so far, by reason."""
+        samples = (sample for family in self._dropped.collect() for sample in family.samples)
+        return {s.labels["reason"]: int(s.value) for s in samples if s.name.endswith("_total")}
+
+    def queue(self, length: int) -> None:
+        """Note how many frame sets wait."""
+        self._queued.set(length)
+
+    def waited(self, seconds: float) -> None:
+        """Note how long a frame set waited before a worker took it."""
+        self._waits.observe(seconds)
+
+    def readers(self, site: str, count: int) -> None:
+        """Note how many subscribers a site's stream has."""
+        self._readers.labels(site).set(count)
+
+    def ready(self, is_ready: bool) -> None:
+        """Note whether the service is ready."""
+        self._ready.set(int(is_ready))
+
+    def forget_site(self, site: str) -> None:
+        """Drop a site's series, so that sites which come and go do not grow the page for ever."""
+        for metric in (self._sets, self._boxes, self._readers):
+            if (site,) in {tuple(s.labels.values()) for family in metric.collect() for s in family.samples}:
+                metric.remove(site)
+
+    def exposition(self) -> bytes:
+        """All metrics in Prometheus' text format."""
+        return generate_latest(self.registry)
