@@ -1,0 +1,124 @@
+"""Scene folders as training samples: canvases as the service would make them, and their truth in canvas pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from models_export.data.dataset import Scene, list_scenes, open_scene
+from service.errors import InputError
+from service.frames import decode
+from service.geometry.boxes import clip_extents, project_extents
+from service.geometry.camera import Camera, ray_azimuth
+from service.geometry.transforms import Array, wrap_angle
+from service.nets.canvas import to_canvas
+
+MIN_VISIBLE = 0.3
+"""Vehicles of which less is visible are neither positives nor negatives."""
+MIN_SIDE_PX = 5.0
+"""Vehicles whose 2D box is smaller in the decoded image are neither positives nor negatives."""
+MAX_TRUNCATED = 0.7
+"""Vehicles of which more lies outside the image are neither positives nor negatives."""
+MAX_DEPTH_M = 150.0
+"""Depths beyond are masked: their inverse is smaller than the noise."""
+VALIDATION_EVERY = 10
+"""Every tenth scene validates; a scene is never on both sides."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One camera's frame."""
+
+    canvas: NDArray[np.uint8]
+    """(H, W, 3) RGB; the image lies in its upper left corner."""
+    image_size: tuple[int, int]
+    """Width and height of the image inside the canvas, px."""
+    camera: Camera
+    """The camera at the image's size."""
+    xyxy_px: Array
+    """(N, 4) extents of the projected boxes, clipped to the image."""
+    ignore: NDArray[np.bool_]
+    """(N,) vehicles that a detector is neither asked for nor blamed for."""
+    cls: NDArray[np.int64]
+    """(N,) class indices."""
+    dims_lwh: Array
+    """(N, 3) metres."""
+    alpha: Array
+    """(N,) heading relative to the ray through the 2D box's centre, radians."""
+    visible: Array
+    """(N,) visible fraction."""
+    truncated: Array
+    """(N,) fraction outside the image."""
+    inverse_depth: NDArray[np.float32]
+    """(h, w) 1 / metres at the depth net's stride; 0 where the depth is unknown."""
+
+
+def split_scenes(roots: Iterable[Path]) -> tuple[list[Path], list[Path]]:
+    """Training and validation scenes of data sets. Raises InputError when a side is empty."""
+    scenes = [scene for root in roots for scene in list_scenes(root)]
+    validation = scenes[VALIDATION_EVERY - 1 :: VALIDATION_EVERY]
+    training = [scene for scene in scenes if scene not in validation]
+    if not training or not validation:
+        raise InputError(
+            f"{len(scenes)} scenes found.",
+            field="data",
+            remedy=f"Training needs at least {VALIDATION_EVERY}: render more with `quadlift scenes render`.",
+        )
+    return training, validation
+
+
+def load_samples(scenes: Iterable[Path], classes: tuple[str, ...], max_width: int, depth_stride: int) -> list[Sample]:
+    """All frames of all cameras of scenes, in memory. classes: lower-case names, in the network's order."""
+    samples = []
+    for path in scenes:
+        scene = open_scene(path)
+        for step in range(scene.steps):
+            for camera_index, camera in enumerate(scene.site.cameras):
+                samples.append(_load_sample(scene, step, camera_index, camera, classes, max_width, depth_stride))
+    return samples
+
+
+def _load_sample(
+    scene: Scene, step: int, camera_index: int, camera: Camera, classes: tuple[str, ...], max_width: int, depth_stride: int
+) -> Sample:
+    truth = scene.truth(step)
+    image = decode(scene.frame_bytes(camera.id, step), camera, max_width)
+    scaled = camera.scaled(image.shape[1], image.shape[0])
+    extents, in_front = project_extents(scaled, truth.center, truth.dims_lwh, truth.yaw)
+    seen = in_front & (truth.visible[:, camera_index] > 0) & np.isin([name.lower() for name in truth.classes], classes)
+    xyxy = clip_extents(scaled, extents[seen])
+    visible, truncated = truth.visible[seen, camera_index], truth.truncated[seen, camera_index]
+    sides = xyxy[:, 2:] - xyxy[:, :2]
+    ignore = (visible < MIN_VISIBLE) | (sides.min(1, initial=np.inf) < MIN_SIDE_PX) | (truncated > MAX_TRUNCATED)
+    names = [truth.classes[i].lower() for i in np.nonzero(seen)[0]]
+    return Sample(
+        canvas=to_canvas(image),
+        image_size=(image.shape[1], image.shape[0]),
+        camera=scaled,
+        xyxy_px=xyxy,
+        ignore=ignore,
+        cls=np.array([classes.index(name) for name in names], dtype=np.int64),
+        dims_lwh=truth.dims_lwh[seen],
+        alpha=wrap_angle(truth.yaw[seen] - ray_azimuth(scaled, (xyxy[:, :2] + xyxy[:, 2:]) / 2)),
+        visible=visible,
+        truncated=truncated,
+        inverse_depth=_inverse_depth(scene.depth(camera.id, step), to_canvas(image).shape[:2], image.shape[:2], depth_stride),
+    )
+
+
+def _inverse_depth(
+    depth_m: NDArray[np.float32], canvas: tuple[int, ...], image: tuple[int, ...], stride: int
+) -> NDArray[np.float32]:
+    """Inverse depth at the centres of the net's cells; nearest neighbour, for a mean of two surfaces is neither."""
+    rows, columns = canvas[0] // stride, canvas[1] // stride
+    scale = depth_m.shape[1] / image[1], depth_m.shape[0] / image[0]
+    x = ((np.arange(columns) + 0.5) * stride * scale[0] - 0.5).astype(np.float32)
+    y = ((np.arange(rows) + 0.5) * stride * scale[1] - 0.5).astype(np.float32)
+    sampled = cv2.remap(depth_m, *np.meshgrid(x, y), cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    known = (sampled > 0) & (sampled < MAX_DEPTH_M)
+    return np.where(known, 1.0 / np.maximum(sampled, 0.1), 0.0).astype(np.float32)

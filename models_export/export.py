@@ -1,0 +1,122 @@
+"""Trained networks to a pack: ONNX files with metadata, checked against torch, quantized, scored, and a manifest."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+from torch import nn
+from torch.export import Dim
+
+from service.nets.canvas import ALIGN_PX
+from service.nets.pack import METADATA_KEY, Manifest, NetworkEntry, open_network
+
+OPSET = 20
+_EXAMPLE_BATCH = 2
+_MAX_TILES = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Exported:
+    """One network ready to be written."""
+
+    name: str
+    model: bytes
+    precision: str
+    parameters: int
+
+
+def to_onnx(net: nn.Module, name: str, example_hw: tuple[int, int], outputs: Sequence[str], *, dynamic_hw: bool) -> bytes:
+    """One self-contained ONNX file of a network in eval mode, input ``images`` (B, H, W, 3) uint8, B dynamic.
+
+    With ``dynamic_hw`` height and width are dynamic too, in multiples of 32 px.
+    """
+    example = torch.zeros((_EXAMPLE_BATCH, *example_hw, 3), dtype=torch.uint8)
+    shape: dict[int, Any] = {0: Dim("batch")}
+    if dynamic_hw:
+        shape |= {1: ALIGN_PX * Dim("rows", min=1, max=_MAX_TILES), 2: ALIGN_PX * Dim("columns", min=1, max=_MAX_TILES)}
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        # The exporter's own deprecations of its internals; nothing of ours.
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            net, (example,), dynamo=True, dynamic_shapes=(shape,), input_names=["images"],
+            output_names=list(outputs), opset_version=OPSET, verbose=False,
+        )  # fmt: skip
+    assert program is not None, "the dynamo exporter returns a program"
+    model: onnx.ModelProto = program.model_proto
+    model.graph.name = name
+    _strip_source_paths(model)
+    return bytes(model.SerializeToString())
+
+
+def with_metadata(model: bytes, metadata: Mapping[str, Any]) -> bytes:
+    """The model with ``metadata`` as JSON under the pack's key, replacing what was there."""
+    proto = onnx.load_from_string(model)
+    kept = [p for p in proto.metadata_props if p.key != METADATA_KEY]
+    del proto.metadata_props[:]
+    proto.metadata_props.extend(kept)
+    entry = proto.metadata_props.add()
+    entry.key, entry.value = METADATA_KEY, json.dumps(metadata)
+    return bytes(proto.SerializeToString())
+
+
+def write_pack(
+    out: Path,
+    exported: Sequence[Exported],
+    *,
+    name: str,
+    version: str,
+    classes: Sequence[str],
+    training: Mapping[str, Any],
+    scores: Mapping[str, Any],
+) -> Manifest:
+    """Write files and manifest of a pack, after each file was opened once as the service will open it."""
+    out.mkdir(parents=True, exist_ok=True)
+    entries = {}
+    for network in exported:
+        open_network(network.name, network.model)
+        path = out / f"{network.name}.onnx"
+        path.write_bytes(network.model)
+        entries[network.name] = NetworkEntry(
+            file=path.name,
+            sha256=hashlib.sha256(network.model).hexdigest(),
+            precision=network.precision,
+            parameters=network.parameters,
+        )
+    manifest = Manifest(
+        name=name,
+        version=version,
+        licence="Apache-2.0",
+        classes=list(classes),
+        networks=entries,
+        training=dict(training),
+        scores=dict(scores),
+    )
+    (out / "manifest.json").write_text(json.dumps(manifest.model_dump(), indent=1) + "\n", encoding="utf-8")
+    return manifest
+
+
+def canvases_of(images: Sequence[NDArray[np.uint8]], batch: int = 4) -> list[NDArray[np.uint8]]:
+    """Equal-sized canvases in batches, for calibration."""
+    return [np.stack(images[i : i + batch]) for i in range(0, len(images) - batch + 1, batch)]
+
+
+def _strip_source_paths(model: onnx.ModelProto) -> None:
+    """Drop the exporter's stack traces: they name files of the machine, and weigh more than the graph."""
+    for node in model.graph.node:
+        del node.metadata_props[:]
+        node.doc_string = ""
+    del model.graph.metadata_props[:]
+    for value in [*model.graph.value_info, *model.graph.input, *model.graph.output]:
+        del value.metadata_props[:]

@@ -1,0 +1,49 @@
+"""Building blocks of the edge networks: plain convolution, batch norm, ReLU, which fold and quantize without loss of speed."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+class Normalise(nn.Module):
+    """uint8 NHWC pixels, 0..255, to float NCHW in -1..1; part of every exported graph."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        """(B, H, W, 3) uint8 to (B, 3, H, W) float."""
+        return images.permute(0, 3, 1, 2).float() * (1.0 / 127.5) - 1.0
+
+
+def conv(cin: int, cout: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
+    """Convolution, batch norm, ReLU; "same" padding."""
+    return nn.Sequential(
+        nn.Conv2d(cin, cout, kernel, stride, kernel // 2, bias=False), nn.BatchNorm2d(cout), nn.ReLU(inplace=True)
+    )
+
+
+class Residual(nn.Module):
+    """Darknet's residual block: 1x1 to half the channels, 3x3 back, added."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.body = nn.Sequential(conv(channels, channels // 2, 1), conv(channels // 2, channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Same shape in and out."""
+        return x + self.body(x)
+
+
+def stage(cin: int, cout: int, residuals: int) -> nn.Sequential:
+    """Halve the resolution, then ``residuals`` residual blocks."""
+    return nn.Sequential(conv(cin, cout, 3, 2), *(Residual(cout) for _ in range(residuals)))
+
+
+def parameter_count(net: nn.Module) -> int:
+    """Number of trained values."""
+    return sum(p.numel() for p in net.parameters())
+
+
+def seed_everything(seed: int) -> torch.Generator:
+    """Seed torch and return a generator for data order."""
+    torch.manual_seed(seed)
+    return torch.Generator().manual_seed(seed)

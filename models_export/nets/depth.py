@@ -1,0 +1,103 @@
+"""The edge depth net: a convolutional stem, self-attention over its 1/32 grid, a light decoder (DPT's plan, small)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from models_export.nets.blocks import Normalise, conv
+
+
+@dataclass(frozen=True)
+class DepthConfig:
+    """Shape of the depth net."""
+
+    stem: tuple[int, int, int, int] = (24, 48, 96, 144)
+    """Channels at strides 4, 8, 16, 32 of the canvas."""
+    width: int = 144
+    """Channels of a token."""
+    blocks: int = 6
+    heads: int = 4
+    mlp_ratio: int = 3
+    decoder: int = 48
+    """Channels of the decoder."""
+    stride: int = 8
+    """Canvas pixels an output cell; fixed by the decoder's plan."""
+
+
+class Attention(nn.Module):
+    """Multi-head self-attention; spelled out, so that the exported graph is plain MatMul and Softmax of dynamic length."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads, self.head_width = heads, width // heads
+        self.qkv = nn.Linear(width, 3 * width)
+        self.project = nn.Linear(width, width)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """(B, N, width) in and out."""
+        batch, count, width = tokens.shape
+        q, k, v = self.qkv(tokens).reshape(batch, count, 3, self.heads, self.head_width).permute(2, 0, 3, 1, 4).unbind(0)
+        weights = torch.softmax((q * self.head_width**-0.5) @ k.transpose(-2, -1), dim=-1)
+        return self.project((weights @ v).transpose(1, 2).reshape(batch, count, width))
+
+
+class Block(nn.Module):
+    """A pre-norm transformer block."""
+
+    def __init__(self, width: int, heads: int, mlp_ratio: int) -> None:
+        super().__init__()
+        self.norm1, self.norm2 = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.attention = Attention(width, heads)
+        self.mlp = nn.Sequential(nn.Linear(width, mlp_ratio * width), nn.GELU(), nn.Linear(mlp_ratio * width, width))
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """(B, N, width) in and out."""
+        tokens = tokens + self.attention(self.norm1(tokens))
+        return tokens + self.mlp(self.norm2(tokens))
+
+
+class EdgeDepth(nn.Module):
+    """uint8 canvases (B, H, W, 3) to affine-invariant inverse depth (B, H / 8, W / 8).
+
+    Positions enter through a zero-padded depth-wise convolution over the token grid, so any canvas size fits one graph.
+    """
+
+    def __init__(self, config: DepthConfig) -> None:
+        super().__init__()
+        self.config = config
+        c4, c8, c16, c32 = config.stem
+        d = config.decoder
+        self.normalise = Normalise()
+        # The half-size picture is enough for depth, and pooling is the cheapest way to it.
+        self.stem4 = nn.Sequential(nn.AvgPool2d(2), conv(3, c4, 3, 2))
+        self.stem8 = nn.Sequential(conv(c4, c8, 3, 2), conv(c8, c8))
+        self.stem16 = conv(c8, c16, 3, 2)
+        self.stem32 = conv(c16, c32, 3, 2)
+        self.embed = nn.Conv2d(c32, config.width, 1)
+        self.position = nn.Conv2d(config.width, config.width, 5, padding=2, groups=config.width)
+        self.blocks = nn.ModuleList(Block(config.width, config.heads, config.mlp_ratio) for _ in range(config.blocks))
+        self.norm = nn.LayerNorm(config.width)
+        self.upsample = nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False)
+        self.from32 = nn.Conv2d(config.width, d, 1)
+        self.from16, self.from8 = nn.Conv2d(c16, d, 1), nn.Conv2d(c8, d, 1)
+        self.fuse16, self.fuse8 = conv(d, d), conv(d, d)
+        self.head = nn.Conv2d(d, 1, 3, padding=1)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """H and W are multiples of 32."""
+        f4 = self.stem4(self.normalise(images))
+        f8 = self.stem8(f4)
+        f16 = self.stem16(f8)
+        grid = self.embed(self.stem32(f16))
+        grid = grid + self.position(grid)
+        batch, width, rows, columns = grid.shape
+        tokens = grid.reshape(batch, width, rows * columns).transpose(1, 2)
+        for block in self.blocks:
+            tokens = block(tokens)
+        grid = self.norm(tokens).transpose(1, 2).reshape(batch, width, rows, columns)
+        x = self.fuse16(self.upsample(self.from32(grid)) + self.from16(f16))
+        x = self.fuse8(self.upsample(x) + self.from8(f8))
+        return self.head(x).squeeze(1)

@@ -1,0 +1,62 @@
+"""Static int8 quantization of an exported network (QDQ, per channel), calibrated on training images."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+from numpy.typing import NDArray
+from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
+
+QUANTIZED_OPS = ["Conv", "Add", "Resize", "MatMul"]
+"""Operators that run in int8; all others stay in float."""
+
+
+class _Calibration(CalibrationDataReader):
+    def __init__(self, input_name: str, batches: Sequence[NDArray[np.uint8]]) -> None:
+        self._name = input_name
+        self._batches = iter(batches)
+
+    def get_next(self) -> dict[str, NDArray[np.uint8]] | None:
+        batch = next(self._batches, None)
+        return None if batch is None else {self._name: batch}
+
+
+def quantize(model: bytes, batches: Sequence[NDArray[np.uint8]], *, keep_float: Sequence[str] = ()) -> bytes:
+    """An int8 copy of a model.
+
+    batches: calibration inputs (B, H, W, 3) uint8. keep_float: outputs whose last operator stays in float, for it feeds
+    an exponential or a sigmoid where a coarse step would show.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder) / "float.onnx", Path(folder) / "int8.onnx"
+        _basic_optimised(model, source)
+        graph = onnx.load(source).graph
+        excluded = [node.name for node in graph.node if set(node.output) & set(keep_float)]
+        quantize_static(
+            source,
+            target,
+            _Calibration(graph.input[0].name, batches),
+            quant_format=QuantFormat.QDQ,
+            per_channel=True,
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+            op_types_to_quantize=QUANTIZED_OPS,
+            nodes_to_exclude=excluded,
+            calibrate_method=CalibrationMethod.MinMax,
+            extra_options={"CalibMovingAverage": True, "ActivationSymmetric": False},
+        )
+        return target.read_bytes()
+
+
+def _basic_optimised(model: bytes, path: Path) -> None:
+    """Fold and fuse with ONNX Runtime itself: its symbolic shape inference, the documented way, fails on the ViT."""
+    options = ort.SessionOptions()
+    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_BASIC
+    options.optimized_model_filepath = str(path)
+    options.log_severity_level = 3
+    ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])

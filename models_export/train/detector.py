@@ -1,0 +1,163 @@
+"""Training of the detector: batches, anchors, target assignment, loss, validation."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.cluster.vq import kmeans2
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from models_export.data.augment import AugmentConfig, flip_horizontally, photometric, rescale
+from models_export.data.samples import MIN_SIDE_PX, Sample
+from models_export.losses import ciou
+from models_export.nets.detector import DetectorConfig, EdgeDetector
+from models_export.train.loop import Batch
+from service.geometry.transforms import Array
+from service.nets.detector import BOX_FIELDS
+
+MAX_RATIO = 4.0
+"""An anchor answers for a box whose sides differ from its own by less than this factor: what (2 sigmoid)^2 can reach."""
+SCALE_BALANCE = (4.0, 1.0, 0.4)
+"""Weights of the objectness of the strides: fine grids hold more cells, and smaller vehicles."""
+BOX_WEIGHT, OBJECT_WEIGHT, CLASS_WEIGHT = 0.05, 1.0, 0.2
+
+
+class DetectorTask:
+    """The detector with its training samples."""
+
+    name = "detector"
+
+    def __init__(self, samples: list[Sample], config: DetectorConfig, augment: AugmentConfig | None = None) -> None:
+        self.samples = samples
+        self.config = replace(config, anchors_px=anchors_of(samples, config.strides))
+        self.augment = augment or AugmentConfig()
+        self.net = EdgeDetector(self.config)
+
+    def describe(self) -> dict[str, Any]:
+        """Configuration of network, data and augmentation."""
+        return {"net": asdict(self.config), "augment": asdict(self.augment), "samples": len(self.samples)}
+
+    def batch(self, rng: np.random.Generator, size: int) -> Batch:
+        """Images (B, H, W, 3) uint8; targets (T, 7): image, class, x0, y0, x1, y1 (px), ignore."""
+        images, targets = [], []
+        for row, index in enumerate(rng.integers(len(self.samples), size=size)):
+            image, boxes = self._augmented(self.samples[index], rng)
+            images.append(image)
+            targets.append(np.concatenate([np.full((len(boxes), 1), float(row)), boxes], 1))
+        return {
+            "images": torch.from_numpy(np.stack(images)),
+            "targets": torch.from_numpy(np.concatenate(targets)).float().reshape(-1, 7),
+        }
+
+    def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
+        """Box, objectness and class losses and their weighted sum."""
+        return detector_loss([head.float() for head in net(batch["images"])], batch["targets"], self.config)
+
+    def _augmented(self, sample: Sample, rng: np.random.Generator) -> tuple[np.ndarray, Array]:
+        image, xyxy = sample.canvas, sample.xyxy_px
+        if rng.random() < self.augment.flip:
+            image, xyxy = flip_horizontally(image, xyxy, sample.image_size[0])
+        if rng.random() < self.augment.geometric:
+            image, xyxy = rescale(image, xyxy, rng, self.augment)
+        height, width = image.shape[:2]
+        clipped = np.clip(xyxy, 0, np.array([width - 1, height - 1] * 2))
+        sides, full = clipped[:, 2:] - clipped[:, :2], np.maximum(xyxy[:, 2:] - xyxy[:, :2], 1e-6)
+        kept = np.prod(sides, axis=1) / np.prod(full, axis=1)
+        ignore = sample.ignore | (sides.min(1, initial=np.inf) < MIN_SIDE_PX) | (kept < 0.3)
+        present = sides.min(1, initial=np.inf) > 1
+        rows = np.concatenate([sample.cls[:, None], clipped, ignore[:, None]], 1)
+        return photometric(image, rng, self.augment), rows[present]
+
+
+def anchors_of(
+    samples: list[Sample], strides: tuple[int, ...], per_scale: int = 3
+) -> tuple[tuple[tuple[float, float], ...], ...]:
+    """Anchors (width, height), px, by k-means over the logarithms of the boxes' sides: smallest for the finest stride.
+
+    Logarithms, for the decoding scales an anchor by a factor.
+    """
+    sides = np.concatenate([s.xyxy_px[~s.ignore][:, 2:] - s.xyxy_px[~s.ignore][:, :2] for s in samples])
+    centers, _ = kmeans2(np.log(sides), per_scale * len(strides), minit="++", seed=0, iter=50)
+    ordered = np.exp(centers[np.argsort(centers.sum(1))])
+    rows = [tuple((round(float(w), 1), round(float(h), 1)) for w, h in group) for group in np.split(ordered, len(strides))]
+    return tuple(rows)
+
+
+def detector_loss(heads: list[Tensor], targets: Tensor, config: DetectorConfig) -> dict[str, Tensor]:
+    """YOLO's loss over all scales.
+
+    heads: (B, A * (5 + C), h, w) logits a stride. targets (T, 7): image, class, x0, y0, x1, y1 (px), ignore. Complete IoU
+    for boxes; binary cross entropy for objectness, whose target is the IoU reached; cells centred in ignored boxes are
+    left out of the objectness unless they answer for a vehicle.
+    """
+    positives = targets[targets[:, 6] == 0]
+    ignored = targets[targets[:, 6] != 0]
+    box = heads[0].new_zeros(())
+    objectness, classes = box.clone(), box.clone()
+    for head, stride, anchors, balance in zip(heads, config.strides, config.anchors_px, SCALE_BALANCE, strict=True):
+        grid = head.unflatten(1, (len(anchors), BOX_FIELDS + len(config.classes))).permute(0, 1, 3, 4, 2)
+        index, truth = assign(positives, grid.shape[2:4], stride, head.new_tensor(anchors))
+        wanted = torch.zeros_like(grid[..., 4])
+        if len(truth):
+            cells = grid[index]
+            overlap = ciou(decode(cells, index, stride, head.new_tensor(anchors)), truth[:, 2:6])
+            box = box + (1 - overlap).mean()
+            wanted[index] = overlap.detach().clamp(min=0).to(wanted.dtype)
+            one_hot = F.one_hot(truth[:, 1].long(), len(config.classes)).to(cells.dtype)
+            classes = classes + F.binary_cross_entropy_with_logits(cells[:, BOX_FIELDS:], one_hot)
+        blamed = ~_covered(ignored, grid.shape, stride, grid.device) | (wanted > 0)
+        losses = F.binary_cross_entropy_with_logits(grid[..., 4], wanted, reduction="none")
+        objectness = objectness + balance * (losses * blamed).mean()
+    total = BOX_WEIGHT * box + OBJECT_WEIGHT * objectness + CLASS_WEIGHT * classes
+    return {"total": total, "box": box, "objectness": objectness, "classes": classes}
+
+
+def assign(targets: Tensor, grid_shape: tuple[int, int], stride: int, anchors: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
+    """Which cells answer for which targets at one scale.
+
+    targets (T, 7), anchors (A, 2) px. A target is answered for by every anchor within ``MAX_RATIO`` of its shape, in its
+    own cell and in the nearer neighbour along each axis (whose centres can reach it). Returns (image, anchor, row,
+    column) index tensors (P,) and the targets (P, 7).
+    """
+    rows, columns = grid_shape
+    size = targets[:, 4:6] - targets[:, 2:4]
+    ratio = size[:, None] / anchors[None]
+    fits = torch.maximum(ratio, 1 / ratio.clamp(min=1e-6)).amax(2) < MAX_RATIO
+    target, anchor = fits.nonzero(as_tuple=True)
+    # Pixel centres lie at integers: pixel p is at (p + 0.5) / stride cells.
+    center = ((targets[target, 2:4] + targets[target, 4:6]) / 2 + 0.5) / stride
+    cell = center.floor()
+    toward = torch.where(center - cell < 0.5, -1.0, 1.0)
+    zero = torch.zeros_like(toward[:, 0])
+    offsets = torch.stack(
+        [torch.zeros_like(toward), torch.stack([toward[:, 0], zero], 1), torch.stack([zero, toward[:, 1]], 1)]
+    )
+    cells = (cell[None] + offsets).reshape(-1, 2).long()
+    target, anchor = target.repeat(3), anchor.repeat(3)
+    inside = (cells[:, 0] >= 0) & (cells[:, 0] < columns) & (cells[:, 1] >= 0) & (cells[:, 1] < rows)
+    target, anchor, cells = target[inside], anchor[inside], cells[inside]
+    return (targets[target, 0].long(), anchor, cells[:, 1], cells[:, 0]), targets[target]
+
+
+def decode(cells: Tensor, index: tuple[Tensor, ...], stride: int, anchors: Tensor) -> Tensor:
+    """Boxes xyxy (P, 4) in px of cells (P, 5 + C) of logits: as ``service.nets.detector.decode_heads``, with gradients."""
+    probability = cells.sigmoid()
+    place = torch.stack([index[3], index[2]], 1)
+    center = (2 * probability[:, :2] - 0.5 + place) * stride - 0.5
+    half = 0.5 * (2 * probability[:, 2:4]) ** 2 * anchors[index[1]]
+    return torch.cat([center - half, center + half], 1)
+
+
+def _covered(ignored: Tensor, shape: torch.Size, stride: int, device: torch.device) -> Tensor:
+    """Cells (B, 1, h, w) whose centre lies in an ignored box."""
+    batch, _, rows, columns, _ = shape
+    covered = torch.zeros((batch, 1, rows, columns), dtype=torch.bool, device=device)
+    x = (torch.arange(columns, device=device) + 0.5) * stride - 0.5
+    y = (torch.arange(rows, device=device) + 0.5) * stride - 0.5
+    for image, _, x0, y0, x1, y1, _ in ignored.tolist():
+        covered[int(image), 0] |= ((y >= y0) & (y <= y1))[:, None] & ((x >= x0) & (x <= x1))[None]
+    return covered

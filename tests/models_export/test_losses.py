@@ -1,0 +1,129 @@
+"""Known answers of the losses: minima at the truth, trimming that trims, masked pixels that never matter."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models_export.losses import align, ciou, depth_loss, gradient_matching_loss, multibin_loss, trimmed_ssi_loss
+
+CENTERS = torch.tensor([0.0, math.pi])
+
+
+def boxes(*rows: tuple[float, float, float, float]) -> torch.Tensor:
+    return torch.tensor(rows, dtype=torch.float32)
+
+
+def test_ciou_of_a_box_with_itself_is_one() -> None:
+    box = boxes((1, 2, 11, 7), (-3, 0, 5, 40))
+    assert torch.allclose(ciou(box, box), torch.ones(2), atol=1e-5)
+
+
+def test_ciou_of_same_shape_is_iou_less_centre_distance() -> None:
+    # Two squares of side 10, shifted by 5: IoU 1/3; hull 15 x 10, its diagonal^2 = 325; distance^2 = 25.
+    value = ciou(boxes((0, 0, 10, 10)), boxes((5, 0, 15, 10)))
+    assert value.item() == pytest.approx(1 / 3 - 25 / 325, abs=1e-5)
+
+
+def test_ciou_has_a_gradient_where_boxes_do_not_touch() -> None:
+    far = boxes((100, 100, 110, 110)).requires_grad_()
+    ciou(far, boxes((0, 0, 10, 10))).sum().backward()
+    assert far.grad is not None
+    assert far.grad.abs().sum() > 0
+
+
+def head_at(alpha: torch.Tensor, confidence: float = 20.0) -> tuple[torch.Tensor, torch.Tensor]:
+    delta = alpha[:, None] - CENTERS[None]
+    vectors = torch.stack([delta.cos(), delta.sin()], -1)
+    nearest = torch.remainder(delta + math.pi, 2 * math.pi).sub(math.pi).abs().argmin(1)
+    return vectors, confidence * torch.nn.functional.one_hot(nearest, 2).float()
+
+
+def test_multibin_loss_is_zero_at_the_truth() -> None:
+    alpha = torch.tensor([0.3, -2.9, 1.5, 3.1])
+    vectors, confidence = head_at(alpha)
+    sizes = torch.randn(4, 3)
+    losses = multibin_loss(vectors, confidence, sizes, alpha, sizes, CENTERS, 0.1)
+    assert losses["total"].item() == pytest.approx(0.0, abs=1e-5)
+
+
+def test_multibin_angle_loss_of_a_quarter_turn_is_one() -> None:
+    alpha = torch.tensor([0.2])
+    vectors, confidence = head_at(alpha + math.pi / 2)
+    losses = multibin_loss(vectors, confidence, torch.zeros(1, 3), alpha, torch.zeros(1, 3), CENTERS, 0.1)
+    assert losses["angle"].item() == pytest.approx(1.0, abs=1e-5)
+
+
+def test_multibin_loss_ignores_the_bin_that_does_not_cover() -> None:
+    alpha = torch.tensor([0.1])
+    vectors, confidence = head_at(alpha)
+    spoiled = vectors.clone()
+    spoiled[:, 1] = torch.tensor([0.0, 1.0])
+    args = (torch.zeros(1, 3), alpha, torch.zeros(1, 3), CENTERS, 0.1)
+    assert torch.equal(multibin_loss(vectors, confidence, *args)["angle"], multibin_loss(spoiled, confidence, *args)["angle"])
+
+
+def test_angle_in_the_overlap_trains_both_bins() -> None:
+    alpha = torch.tensor([math.pi / 2 + 0.05])
+    vectors, confidence = head_at(alpha)
+    spoiled = vectors.clone()
+    spoiled[:, 0] = -spoiled[:, 0]
+    losses = multibin_loss(spoiled, confidence, torch.zeros(1, 3), alpha, torch.zeros(1, 3), CENTERS, 0.1)
+    assert losses["angle"].item() == pytest.approx(1.0, abs=1e-5)
+
+
+@given(scale=st.floats(0.1, 10), shift=st.floats(-5, 5), seed=st.integers(0, 100))
+def test_depth_loss_is_zero_up_to_scale_and_shift(scale: float, shift: float, seed: int) -> None:
+    target = torch.rand(2, 8, 12, generator=torch.Generator().manual_seed(seed))
+    mask = torch.ones_like(target, dtype=torch.bool)
+    assert depth_loss(scale * target + shift, target, mask)["total"].item() == pytest.approx(0.0, abs=1e-4)
+
+
+def test_masked_pixels_never_matter() -> None:
+    generator = torch.Generator().manual_seed(0)
+    prediction, target = torch.rand(2, 8, 12, generator=generator), torch.rand(2, 8, 12, generator=generator)
+    mask = torch.rand(2, 8, 12, generator=generator) > 0.4
+    noise = torch.where(mask, torch.zeros(()), 1e3 * torch.rand(2, 8, 12, generator=generator))
+    expected = depth_loss(prediction, target, mask)["total"]
+    assert torch.allclose(depth_loss(prediction + noise, target - noise, mask)["total"], expected, atol=1e-6)
+
+
+def test_trimming_really_trims() -> None:
+    target = torch.linspace(0, 1, 100).reshape(1, 10, 10)
+    mask = torch.ones_like(target, dtype=torch.bool)
+    spoiled = target.clone()
+    # Ten of a hundred pixels exchanged among themselves: the median and the mean deviation stay what they were.
+    spoiled.view(-1)[95:100] = target.view(-1)[0:5]
+    spoiled.view(-1)[0:5] = target.view(-1)[95:100]
+    assert trimmed_ssi_loss(spoiled, target, mask, trim=0.2).item() == pytest.approx(0.0, abs=1e-6)
+    assert trimmed_ssi_loss(spoiled, target, mask, trim=0.0).item() > 0.05
+
+
+def test_an_image_without_depth_counts_as_nothing() -> None:
+    prediction = torch.rand(1, 4, 4, requires_grad=True)
+    losses = depth_loss(prediction, torch.rand(1, 4, 4), torch.zeros(1, 4, 4, dtype=torch.bool))
+    losses["total"].backward()
+    assert losses["total"].item() == 0.0
+    assert prediction.grad is not None
+    assert torch.all(torch.isfinite(prediction.grad))
+
+
+def test_align_gives_median_zero_and_mean_deviation_one() -> None:
+    values = torch.rand(3, 5, 7, generator=torch.Generator().manual_seed(1))
+    mask = torch.ones_like(values, dtype=torch.bool)
+    aligned = align(values, mask).flatten(1)
+    assert torch.allclose(aligned.median(1).values, torch.zeros(3), atol=1e-6)
+    assert torch.allclose(aligned.abs().mean(1), torch.ones(3), atol=1e-5)
+
+
+def test_gradient_loss_sees_an_edge_of_known_height() -> None:
+    target = torch.zeros(1, 2, 4)
+    target[..., 2:] = 1.0
+    mask = torch.ones_like(target, dtype=torch.bool)
+    # Aligned target: median 0, mean deviation 1/2, so the step is 2; one step in each of two rows over 8 pixels.
+    flat = torch.zeros_like(target)
+    assert gradient_matching_loss(flat, target, mask, scales=1).item() == pytest.approx(2 * 2 / 8, abs=1e-6)
