@@ -1,0 +1,104 @@
+"""What a road world is made of: lanes to drive on, places to park, land to build on, poles for cameras.
+
+Everything is laid out with the roads along x and y; :mod:`models_export.scenes.generate` turns the whole world afterwards.
+Traffic keeps to the right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from models_export.scenes.mesh import Array, MeshBuilder
+
+REACH_M = 130.0
+"""Roads run this far from the origin."""
+SPACING_M = 0.5
+"""Distance between the points of a route."""
+
+
+@dataclass(frozen=True, eq=False)
+class Route:
+    """A way through the world that vehicles drive along."""
+
+    points: Array
+    """(P, 2) every ``SPACING_M`` metres, world x, y."""
+    phase: int
+    """Traffic light group that lets it go; -1 for no light."""
+    stop_at_m: float
+    """Distance along the route of its stop line; infinite where there is none."""
+    speed_mps: float
+    """What drivers want to do on its straights."""
+    turn_mps: float
+    """Speed within its curve."""
+    curve_m: tuple[float, float]
+    """Where the curve starts and ends along the route; an empty range for none."""
+
+    @property
+    def length_m(self) -> float:
+        """Length of the route."""
+        return SPACING_M * (len(self.points) - 1)
+
+
+@dataclass(frozen=True)
+class Bay:
+    """A place for a parked car: position and heading."""
+
+    x: float
+    y: float
+    yaw: float
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Land beside the road for a building, trees or nothing: axis-aligned, its front edge on the road side."""
+
+    low: tuple[float, float]
+    high: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class RoadWorld:
+    """The layout of one world."""
+
+    kind: str
+    ground: MeshBuilder
+    routes: tuple[Route, ...]
+    bays: tuple[Bay, ...]
+    plots: tuple[Plot, ...]
+    poles: tuple[tuple[Array, Array], ...]
+    """Camera poles: foot (2,) and the point on the ground (2,) that the camera looks towards."""
+    phases: int
+    """Number of traffic light groups; 0 without lights."""
+
+
+def turned(arm: int) -> Array:
+    """Rotation (2, 2) from the frame of an arm (its road comes in along +x from the east) to the world."""
+    c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[arm]
+    return np.array([[c, -s], [s, c]], dtype=np.float64)
+
+
+def rounded(corner: Array, radius: float) -> Array:
+    """A polyline of three points (3, 2) with its corner replaced by an arc."""
+    a, b, c = corner
+    into, out = (b - a) / np.linalg.norm(b - a), (c - b) / np.linalg.norm(c - b)
+    center = b - into * radius + out * radius
+    angle = np.linspace(0, np.pi / 2, 24)[:, None]
+    arc = center - out * radius * np.cos(angle) + into * radius * np.sin(angle)
+    return np.concatenate([a[None], arc, c[None]])
+
+
+def resampled(line: Array) -> Array:
+    """A polyline (N, 2) with points every ``SPACING_M``."""
+    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    distance = np.concatenate([[0], np.cumsum(steps)])
+    places = np.arange(0, distance[-1], SPACING_M)
+    return np.stack([np.interp(places, distance, line[:, k]) for k in range(2)], 1)
+
+
+def plot(sx: int, sy: int, low: tuple[float, float], high: tuple[float, float]) -> Plot:
+    """A plot given by its corners in the first quarter, mirrored into the quarter with signs ``sx``, ``sy``."""
+    corners = np.array([low, high]) * np.array([sx, sy])
+    (x0, y0), (x1, y1) = corners.min(0).tolist(), corners.max(0).tolist()
+    return Plot((x0, y0), (x1, y1))
