@@ -4,6 +4,8 @@ import { boxCorners, projectBox } from "./viewer-geometry.js";
 
 const FONT = 'Inter, "Segoe UI", system-ui, -apple-system, Roboto, "DejaVu Sans", sans-serif';
 const CONE_M = 32;
+const FIT_M = 38; // How far before each camera the map shows at first.
+const MIN_TAG_PX = 13; // Smaller boxes get no number: in the distance the numbers would hide the vehicles.
 const TRAIL_MS = 4000;
 const TRAIL_JUMP_M = 8; // A longer step is another vehicle under the same number, not a movement.
 const GOLDEN_ANGLE = 137.508;
@@ -71,7 +73,9 @@ export function drawCamera(canvas, camera, picture, boxes) {
     context.stroke();
     context.setLineDash([]);
     const [x0, y0] = view.extent;
-    if (own) tag(context, box.track_id ?? box.class, Math.max(2, x0 * scale), Math.max(16, y0 * scale - 2), trackColor(box.track_id, 0.92));
+    if (own && (view.extent[2] - x0) * scale >= MIN_TAG_PX) {
+      tag(context, box.track_id ?? box.class, Math.max(2, x0 * scale), Math.max(16, y0 * scale - 2), trackColor(box.track_id, 0.92));
+    }
   }
   context.globalAlpha = 1;
 }
@@ -89,8 +93,9 @@ export class BirdsEye {
     new ResizeObserver(() => { if (!this.moved) this.view = null; this.draw(); }).observe(canvas);
   }
 
-  setCameras(cameras) {
-    Object.assign(this, { cameras, boxes: [], view: null, moved: false });
+  /** Start anew with a site's cameras and the picture of its ground. */
+  setSite(cameras, ground) {
+    Object.assign(this, { cameras, ground, boxes: [], view: null, moved: false });
     this.trails.clear();
     this.draw();
   }
@@ -114,13 +119,13 @@ export class BirdsEye {
   /** Show all cameras and what lies before them. */
   fit() {
     const width = this.canvas.clientWidth, height = this.canvas.clientHeight;
-    const points = this.cameras.flatMap(({ position: [x, y], heading }) => [
+    const points = this.cameras.flatMap(({ position: [x, y], heading, halfAngle }) => [
       [x, y],
-      [x + CONE_M * Math.cos(heading), y + CONE_M * Math.sin(heading)],
+      ...[-halfAngle, 0, halfAngle].map((turn) => [x + FIT_M * Math.cos(heading + turn), y + FIT_M * Math.sin(heading + turn)]),
     ]);
     if (!points.length) points.push([-30, -30], [30, 30]);
     const xs = points.map((p) => p[0]), ys = points.map((p) => p[1]);
-    const spanX = Math.max(...xs) - Math.min(...xs) + 16, spanY = Math.max(...ys) - Math.min(...ys) + 16;
+    const spanX = Math.max(...xs) - Math.min(...xs) + 8, spanY = Math.max(...ys) - Math.min(...ys) + 8;
     this.view = {
       x: (Math.max(...xs) + Math.min(...xs)) / 2,
       y: (Math.max(...ys) + Math.min(...ys)) / 2,
@@ -138,6 +143,7 @@ export class BirdsEye {
     if (!this.canvas.clientWidth) return;
     if (!this.view) this.fit();
     context.clearRect(0, 0, this.canvas.clientWidth, this.canvas.clientHeight);
+    this.ground?.draw(context, (x, y) => this.toScreen(x, y), this.view.scale);
     this.drawGrid(context);
     for (const camera of this.cameras) this.drawCone(context, camera);
     for (const [id, trail] of this.trails) this.drawTrail(context, id, trail);
@@ -151,14 +157,14 @@ export class BirdsEye {
     const step = [1, 2, 5, 10, 20, 50, 100, 200].find((s) => s * view.scale >= 44) ?? 500;
     context.font = `10.5px ${FONT}`;
     const line = (major, x0, y0, x1, y1) => {
-      context.strokeStyle = major ? "#2c3746" : "#1b2330";
+      context.strokeStyle = major ? "rgb(160 185 220 / 22%)" : "rgb(160 185 220 / 9%)";
       context.lineWidth = 1;
       context.beginPath();
       context.moveTo(x0, y0);
       context.lineTo(x1, y1);
       context.stroke();
     };
-    context.fillStyle = "#56627a";
+    context.fillStyle = "#6b788f";
     const halfX = width / 2 / view.scale, halfY = height / 2 / view.scale;
     for (let x = Math.ceil((view.x - halfX) / step) * step; x <= view.x + halfX; x += step) {
       const [sx] = this.toScreen(x, 0);
@@ -184,7 +190,7 @@ export class BirdsEye {
     const [x, y] = this.toScreen(...camera.position);
     const radius = CONE_M * this.view.scale;
     const gradient = context.createRadialGradient(x, y, 0, x, y, radius);
-    gradient.addColorStop(0, `rgb(${this.color(camera)} / 24%)`);
+    gradient.addColorStop(0, `rgb(${this.color(camera)} / 13%)`);
     gradient.addColorStop(1, `rgb(${this.color(camera)} / 0%)`);
     context.fillStyle = gradient;
     context.beginPath();

@@ -37,6 +37,12 @@ function pixel(camera, [X, Y, Z]) {
   return [K[0][0] * x + K[0][1] * y + K[0][2], K[1][1] * y + K[1][2]];
 }
 
+/** Pixel of a world point, or null when it lies behind the camera. */
+export function projectPoint(camera, point) {
+  const inCamera = toCamera(camera.T_cam_world, point);
+  return inCamera[2] < NEAR_M ? null : pixel(camera, inCamera);
+}
+
 /** A polyline in px of the part of segment a-b (camera frame) that lies before the camera. */
 function projectSegment(camera, a, b) {
   if (a[2] < NEAR_M && b[2] < NEAR_M) return [];

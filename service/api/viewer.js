@@ -2,6 +2,7 @@
 
 import { BirdsEye, drawCamera } from "./viewer-draw.js";
 import { prepareCameras } from "./viewer-geometry.js";
+import { GroundPicture } from "./viewer-ground.js";
 
 const STAGES = { decode: "#6ea8fe", detect: "#46d6b4", orient: "#b18cff", depth: "#f58fb6", lift: "#f5b84b", fuse: "#8fd14f", track: "#ff8a5c" };
 const BUDGET_MS = 1000 / 30;
@@ -117,6 +118,7 @@ async function present(message) {
     }
     drawCamera(tile.canvas, camera, tile.picture, pictures[i] ? message.boxes : []);
   });
+  map.ground.update(new Map(state.cameras.map((camera, i) => [camera.id, pictures[i]])));
   map.update(message);
   showFigures(message);
 }
@@ -205,7 +207,7 @@ function useSite(site) {
   Object.assign(state, { site: site.id, cameras: prepareCameras(site), last: null });
   state.tiles = new Map(state.cameras.map((camera) => [camera.id, makeTile(camera)]));
   layOut();
-  map.setCameras(state.cameras);
+  map.setSite(state.cameras, new GroundPicture(site, state.cameras));
 }
 
 /** The site of the address bar, else the first; null while there is none. */

@@ -35,13 +35,13 @@ class DepthNet:
             self.sigma_relative = float(network.metadata["sigma_relative"])
         except (KeyError, TypeError, ValueError) as error:
             raise PackError(f"metadata is incomplete: {error!r}.", field="depth", remedy="Export the pack again.") from error
-        self._network = network
+        self.network = network
 
     def infer(self, images: Sequence[NDArray[np.uint8]]) -> list[InverseDepth]:
         """Inverse depth of images (H, W, 3) RGB uint8, which may differ in size; cells of the padding are cut off."""
         results: list[InverseDepth | None] = [None] * len(images)
         for members, canvases in batches(images):
-            (maps,) = self._network.run(canvases)
+            (maps,) = self.network.run(canvases)
             for row, member in enumerate(members):
                 height, width = images[member].shape[:2]
                 values = maps[row, : -(-height // self.stride), : -(-width // self.stride)]

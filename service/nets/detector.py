@@ -68,7 +68,7 @@ class Detector:
 
     def __init__(self, network: Network) -> None:
         self.spec = DetectorSpec.from_metadata(network.metadata)
-        self._network = network
+        self.network = network
 
     def detect(
         self, images: Sequence[NDArray[np.uint8]], *, score_threshold: float = 0.3, nms_iou: float = 0.55
@@ -76,7 +76,7 @@ class Detector:
         """2D boxes in images (H, W, 3) RGB uint8, which may differ in size; one result an image."""
         results: list[Detections | None] = [None] * len(images)
         for members, canvases in batches(images):
-            heads = self._network.run(canvases)
+            heads = self.network.run(canvases)
             for row, member in enumerate(members):
                 raw = decode_heads([head[row] for head in heads], self.spec, score_threshold)
                 results[member] = suppress(raw, nms_iou)

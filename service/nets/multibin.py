@@ -63,13 +63,13 @@ class Multibin:
 
     def __init__(self, network: Network) -> None:
         self.spec = MultibinSpec.from_metadata(network.metadata)
-        self._network = network
+        self.network = network
 
     def estimate(self, crops: NDArray[np.uint8], cls: NDArray[np.int64]) -> MultibinEstimates:
         """Estimates for crops (N, S, S, 3) RGB uint8 of vehicles of classes (N,). N may be 0."""
         if len(crops) == 0:
             return MultibinEstimates(np.zeros(0), np.zeros(0), np.zeros((0, 3)))
-        vectors, confidence, residual = self._network.run(crops)
+        vectors, confidence, residual = self.network.run(crops)
         return decode_multibin(vectors, confidence, residual, cls, self.spec)
 
 

@@ -1,0 +1,69 @@
+"""The bare loop: decoding and the three networks on the same frames, with nothing around them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.frames import FrameSet, decode
+from service.nets.canvas import batches
+from service.nets.multibin import crop_vehicles
+from service.pipeline import Pipeline
+
+
+@dataclass(frozen=True, eq=False)
+class _Work:
+    frame_set: FrameSet
+    crops: NDArray[np.uint8]
+    """What the multi-bin head gets for this set, cut beforehand."""
+
+
+class BareLoop:
+    """Runs the networks of a pipeline over frame sets as fast as they go."""
+
+    def __init__(self, pipeline: Pipeline, sets: Sequence[FrameSet]) -> None:
+        self._pipeline = pipeline
+        self._work = [self._prepare(frame_set) for frame_set in sets]
+
+    def run(self, seconds: float, threads: int) -> tuple[int, float]:
+        """Sets done by ``threads`` threads in about ``seconds``, and the seconds it really took."""
+        done = [0] * threads
+        started = time.perf_counter()
+
+        def worker(number: int) -> None:
+            turn = number
+            while time.perf_counter() - started < seconds:
+                self._run(self._work[turn % len(self._work)])
+                turn += threads
+                done[number] += 1
+
+        workers = [threading.Thread(target=worker, args=(number,)) for number in range(threads)]
+        for thread in workers:
+            thread.start()
+        for thread in workers:
+            thread.join()
+        return sum(done), time.perf_counter() - started
+
+    def _run(self, work: _Work) -> None:
+        pipeline = self._pipeline
+        for _, canvases in batches(self._images(work.frame_set)):
+            pipeline.detector.network.run(canvases)
+            pipeline.depth.network.run(canvases)
+        if len(work.crops):
+            pipeline.multibin.network.run(work.crops)
+
+    def _prepare(self, frame_set: FrameSet) -> _Work:
+        images, settings = self._images(frame_set), self._pipeline.settings
+        found = self._pipeline.detector.detect(images, score_threshold=settings.score_threshold, nms_iou=settings.nms_iou)
+        side = self._pipeline.multibin.spec.crop_px
+        crops = [crop_vehicles(image, boxes.xyxy_px, side) for image, boxes in zip(images, found, strict=True)]
+        return _Work(frame_set, np.concatenate(crops))
+
+    def _images(self, frame_set: FrameSet) -> list[NDArray[np.uint8]]:
+        width = self._pipeline.detector.spec.max_width
+        return [decode(frame.data, frame_set.site.camera(frame.camera_id), width) for frame in frame_set.frames]
