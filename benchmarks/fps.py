@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import itertools
 import json
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,8 +21,7 @@ from rich.table import Table
 from benchmarks.bare import BareLoop
 from benchmarks.clip_sets import clip_frame_sets
 from benchmarks.machine import describe_machine
-from benchmarks.served import Served
-from clients.client import ServiceError
+from benchmarks.measured import Measured
 from clients.clip import ClipError
 from service.errors import OverloadError, QuadliftError
 from service.frames import FrameSet
@@ -48,29 +45,6 @@ class Via(StrEnum):
     HTTP = "http"
 
 
-@dataclass
-class Measured:
-    """What one way of running gave."""
-
-    sets: int = 0
-    seconds: float = 0.0
-    dropped: int = 0
-    latency_ms: list[float] = field(default_factory=list)
-    stages_ms: dict[str, list[float]] = field(default_factory=dict)
-
-    def note(self, latency_ms: float, timing_ms: dict[str, float]) -> None:
-        """One finished set."""
-        self.sets += 1
-        self.latency_ms.append(latency_ms)
-        for stage, value in timing_ms.items():
-            self.stages_ms.setdefault(stage, []).append(value)
-
-    @property
-    def sets_per_second(self) -> float:
-        """Throughput."""
-        return self.sets / self.seconds if self.seconds else 0.0
-
-
 def run_inproc(scheduler: Scheduler, sets: Iterator[FrameSet], seconds: float, in_flight: int, into: Measured) -> None:
     """Keep ``in_flight`` sets in the scheduler for a time: a closed loop, so nothing queues for long."""
     flying: deque[tuple[float, Future[SetResult]]] = deque()
@@ -85,35 +59,6 @@ def run_inproc(scheduler: Scheduler, sets: Iterator[FrameSet], seconds: float, i
             into.dropped += 1
             continue
         into.note(1e3 * (time.perf_counter() - begun), result.timing_ms)
-    into.seconds += time.perf_counter() - started
-
-
-def run_http(served: Served, sets: Sequence[FrameSet], seconds: float, clients: int, into: Measured) -> None:
-    """``clients`` connections, each posting one set after the other."""
-    lock, counter = threading.Lock(), itertools.count()
-    started = time.perf_counter()
-
-    def client() -> None:
-        with served.client() as connection:
-            while time.perf_counter() - started < seconds:
-                frame_set = sets[next(counter) % len(sets)]
-                begun = time.perf_counter()
-                try:
-                    message = connection.detect(frame_set.site.id, {f.camera_id: f.data for f in frame_set.frames})
-                except ServiceError as error:
-                    if error.status != 503:
-                        raise
-                    with lock:
-                        into.dropped += 1
-                    continue
-                with lock:
-                    into.note(1e3 * (time.perf_counter() - begun), message.timing_ms)
-
-    threads = [threading.Thread(target=client) for _ in range(clients)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
     into.seconds += time.perf_counter() - started
 
 
@@ -137,6 +82,9 @@ def _way(
     pack: str, pipeline: Pipeline, sets: Sequence[FrameSet], via: Via, workers: int
 ) -> Iterator[Callable[[float, Measured], None]]:
     if via is Via.HTTP:
+        # Needs the extra `clients`; the way in process does not.
+        from benchmarks.served import Served, run_http
+
         with Served(pack, sets[0].site, workers) as served:
             yield lambda seconds, into: run_http(served, sets, seconds, workers + 1, into)
         return
@@ -203,7 +151,7 @@ def bench_fps(
     try:
         sets = clip_frame_sets(cameras=cameras, site=load_site(site) if site else None)
         ours, bare = measure(pack, sets, seconds, via, workers or usable_cores())
-    except (QuadliftError, ClipError, ServiceError) as error:
+    except (QuadliftError, ClipError) as error:
         console.print(f"[red]{error}[/red]")
         raise typer.Exit(2) from None
     figures = report(ours, bare, target, pack, via, len(sets[0].frames))

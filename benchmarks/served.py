@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 from urllib.error import URLError
 from urllib.request import urlopen
 
-from clients.client import Client
+from benchmarks.measured import Measured
+from clients.client import Client, ServiceError
 from service.errors import QuadliftError
+from service.frames import FrameSet
 from service.site import Site, save_site
 
 START_S = 60.0
@@ -31,7 +36,7 @@ class Served:
         save_site(site, site_file)
         self.port = _free_port()
         options = ["--port", str(self.port), "--site", str(site_file), "--pack", pack, "--workers", str(workers)]
-        self._process = subprocess.Popen(
+        self.process = subprocess.Popen(
             [sys.executable, "-m", "service.cli", "serve", *options],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
@@ -50,8 +55,8 @@ class Served:
     def __enter__(self) -> Self:
         deadline = time.monotonic() + START_S
         while time.monotonic() < deadline:
-            if self._process.poll() is not None:
-                raise QuadliftError(f"the service ended at its start: {self._process.communicate()[1][-2000:]}")
+            if self.process.poll() is not None:
+                raise QuadliftError(f"the service ended at its start: {self.process.communicate()[1][-2000:]}")
             try:
                 with urlopen(f"{self.url}/health/ready", timeout=2):
                     return self
@@ -65,13 +70,48 @@ class Served:
         self._stop()
 
     def _stop(self) -> None:
-        self._process.terminate()
+        self.process.terminate()
         try:
-            self._process.communicate(timeout=STOP_S)
+            self.process.communicate(timeout=STOP_S)
         except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.communicate()
+            self.process.kill()
+            self.process.communicate()
         self._folder.cleanup()
+
+
+def run_http(served: Served, sets: Sequence[FrameSet], seconds: float, clients: int, into: Measured) -> None:
+    """``clients`` connections, each posting one set after the other. Raises QuadliftError when the service refuses one."""
+    lock, counter = threading.Lock(), itertools.count()
+    failures: list[ServiceError] = []
+    started = time.perf_counter()
+
+    def client() -> None:
+        with served.client() as connection:
+            while time.perf_counter() - started < seconds:
+                frame_set = sets[next(counter) % len(sets)]
+                begun = time.perf_counter()
+                try:
+                    message = connection.detect(frame_set.site.id, {f.camera_id: f.data for f in frame_set.frames})
+                except ServiceError as error:
+                    with lock:
+                        if error.status == 503:
+                            into.dropped += 1
+                        else:
+                            failures.append(error)
+                    if failures:
+                        return
+                    continue
+                with lock:
+                    into.note(1e3 * (time.perf_counter() - begun), message.timing_ms.model_dump())
+
+    threads = [threading.Thread(target=client) for _ in range(clients)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    if failures:
+        raise QuadliftError(f"the service refused a frame set: {failures[0]}")
+    into.seconds += time.perf_counter() - started
 
 
 def _free_port() -> int:

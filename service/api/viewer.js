@@ -9,7 +9,7 @@ const BUDGET_MS = 1000 / 30;
 const SMOOTHING = 0.15;
 const RATE_WINDOW_MS = 3000;
 const SILENT_MS = 2500;
-const RETRY_MS = [500, 8000];
+const RETRY_MS = [500, 4000];
 const MAX_LATENCY_MS = 600000; // Beyond this the capture times are not of now (a replay), so a latency would say nothing.
 
 const $ = (id) => document.getElementById(id);
@@ -27,8 +27,9 @@ function show(tone, text, notice = "") {
 }
 
 async function getJson(path) {
-  const response = await fetch(path, { cache: "no-store" });
-  if (!response.ok) throw new Error(`${path}: ${response.status}`);
+  const response = await fetch(path, { cache: "no-store" }).catch(() => null);
+  if (!response) throw new Error("The service does not answer.");
+  if (!response.ok) throw new Error(`The service answered ${response.status} to /${path}.`);
   return response.json();
 }
 
