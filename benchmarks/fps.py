@@ -83,10 +83,10 @@ def _way(
 ) -> Iterator[Callable[[float, Measured], None]]:
     if via is Via.HTTP:
         # Needs the extra `clients`; the way in process does not.
-        from benchmarks.served import Served, run_http
+        from benchmarks.served import run_http, served
 
-        with Served(pack, sets[0].site, workers) as served:
-            yield lambda seconds, into: run_http(served, sets, seconds, workers + 1, into)
+        with served(pack, sets[0].site, workers) as url:
+            yield lambda seconds, into: run_http(url, sets, seconds, workers + 1, into)
         return
     scheduler = Scheduler(pipeline, workers=workers)
     endless = itertools.cycle(sets)

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import statistics
-import subprocess
 import sys
-import tempfile
 import time
 import webbrowser
 from collections import deque
@@ -18,9 +15,8 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import FrameType
-from typing import IO, Annotated
+from typing import Annotated
 
-import httpx
 import typer
 from rich.console import Console
 from rich.live import Live
@@ -28,16 +24,12 @@ from rich.text import Text
 
 from clients.client import Client, ServiceError
 from clients.clip import SHIPPED, Clip, ClipError, open_clip
+from clients.local_service import HOST, LocalServiceError, free_port, running_service
 
-READY_TIMEOUT_S = 60.0
-"""Loading and warming the networks takes a few seconds; a slow disk may take longer."""
-STOP_TIMEOUT_S = 10.0
 FAILURES_IN_A_ROW = 50
 """After so many refused frame sets the demo gives up."""
-_POLL_S = 0.1
 _STATUS_HZ = 4.0
 _RECENT = 50
-_HOST = "127.0.0.1"
 
 app = typer.Typer(add_completion=False)
 console = Console()
@@ -106,7 +98,7 @@ def demo(
     except KeyboardInterrupt:
         # Ctrl-C is how the demo is meant to end.
         pass
-    except (ClipError, DemoError) as error:
+    except (ClipError, DemoError, LocalServiceError) as error:
         console.print(Text.assemble(("Error: ", "bold red"), str(error)))
         raise typer.Exit(1) from None
     console.print(summary(progress), highlight=False)
@@ -123,20 +115,6 @@ def summary(progress: Progress) -> str:
     return f"{text} Last refusal: {progress.last_failure}" if progress.last_failure else text
 
 
-def free_port(wanted: int) -> int:
-    """``wanted`` if it can be listened on, else a free port."""
-    for port in (wanted, 0):
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind((_HOST, port))
-            except OSError:
-                continue
-            chosen: int = probe.getsockname()[1]
-            return chosen
-    raise DemoError(f"no TCP port can be opened on {_HOST}.")
-
-
 def has_display() -> bool:
     """Whether a browser window can be shown."""
     if sys.platform.startswith("linux"):
@@ -144,33 +122,11 @@ def has_display() -> bool:
     return True
 
 
-@contextmanager
-def running_service(site_file: Path, port: int) -> Iterator[subprocess.Popen[bytes]]:
-    """The service as a child process, for as long as the block runs; raises DemoError with its log when it does not start."""
-    # The `service` beside this package, and no folder of that name in the working directory.
-    beside = str(Path(__file__).resolve().parents[1])
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [beside, os.environ.get("PYTHONPATH")]))}
-    command = [sys.executable, "-P", "-c", "from service.cli import main; main()", "serve"]
-    command += ["--host", _HOST, "--port", str(port), "--site", str(site_file)]
-    with tempfile.TemporaryFile() as log:
-        # In a session of its own, Ctrl-C reaches the demo alone, which then stops its child in order.
-        child = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True, env=environment)
-        try:
-            _wait_until_ready(child, f"http://{_HOST}:{port}")
-            yield child
-        except DemoError as error:
-            if child.poll() is None:
-                raise
-            raise DemoError(f"{error} The service's last words:\n{_tail(log)}") from error
-        finally:
-            _stop(child)
-
-
 def _run(clip: Clip, port: int, browser: bool, seconds: float | None, rate_hz: float, progress: Progress) -> None:
     chosen = free_port(port)
     if port not in (0, chosen):
         console.print(f"Port {port} is taken; using {chosen}.", highlight=False)
-    url = f"http://{_HOST}:{chosen}"
+    url = f"http://{HOST}:{chosen}"
     console.print("Starting the service…")
     with running_service(clip.path / "site.json", chosen), Client(url) as client:
         announce(url, browser)
@@ -231,35 +187,6 @@ def status_line(progress: Progress, url: str) -> Text:
 def utc_from_ns(time_ns: int) -> datetime:
     """The time of nanoseconds since 1970, to the microsecond."""
     return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=time_ns // 1000)
-
-
-def _wait_until_ready(child: subprocess.Popen[bytes], url: str) -> None:
-    deadline = time.monotonic() + READY_TIMEOUT_S
-    while child.poll() is None:
-        try:
-            if httpx.get(f"{url}/health/ready", timeout=2.0).is_success:
-                return
-        except httpx.TransportError:
-            # Not listening yet; the deadline decides.
-            pass
-        if time.monotonic() > deadline:
-            raise DemoError(f"the service was not ready after {READY_TIMEOUT_S:.0f} s.")
-        time.sleep(_POLL_S)
-    raise DemoError("the service did not start.")
-
-
-def _stop(child: subprocess.Popen[bytes]) -> None:
-    child.terminate()
-    try:
-        child.wait(STOP_TIMEOUT_S)
-    except subprocess.TimeoutExpired:
-        child.kill()
-        child.wait()
-
-
-def _tail(log: IO[bytes], lines: int = 15) -> str:
-    log.seek(0)
-    return "\n".join(log.read().decode("utf-8", "replace").splitlines()[-lines:]) or "(it printed nothing)"
 
 
 @contextmanager

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models_export.data.samples import Sample
+from service.errors import InputError
 from service.geometry.camera import ray_azimuth
 from service.geometry.iou import iou_2d
 from service.geometry.transforms import Array, wrap_angle
@@ -25,6 +26,7 @@ SCORE_FLOOR = 0.05
 MATCH_IOU = 0.6
 """Detections that overlap a vehicle by more measure edges, angles and sizes."""
 _NORMAL_68 = 68.27
+_SIZE_BINS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,17 +97,24 @@ def average_precision(detections: Sequence[Detections], samples: Sequence[Sample
 
 
 def edge_sigma_fit(matches: Sequence[Matched]) -> tuple[float, float]:
-    """(a, b) of sigma = a + b * sqrt(width * height), px: the 68th percentile of edge errors in bins of box size."""
+    """(a, b) of sigma = a + b * sqrt(width * height), px: the 68th percentile of edge errors in bins of box size.
+
+    Raises InputError when there are too few matches to measure anything.
+    """
     sizes, errors = [], []
     for m in matches:
         truth = m.sample.xyxy_px[m.truth]
         sizes.append(np.repeat(np.sqrt(np.prod(truth[:, 2:] - truth[:, :2], axis=1)), 4))
         errors.append(np.abs(m.xyxy_px - truth).reshape(-1))
-    size, error = np.concatenate(sizes), np.concatenate(errors)
-    edges = np.quantile(size, np.linspace(0, 1, 9))
-    bins = np.clip(np.searchsorted(edges, size, side="right") - 1, 0, 7)
-    centers = np.array([size[bins == b].mean() for b in range(8)])
-    sigmas = np.array([np.percentile(error[bins == b], _NORMAL_68) for b in range(8)])
+    size, error = np.concatenate(sizes or [np.zeros(0)]), np.concatenate(errors or [np.zeros(0)])
+    if len(size) < _SIZE_BINS:
+        raise InputError(
+            "the detector finds next to nothing on the validation scenes.", field="detector", remedy="Train it longer."
+        )
+    edges = np.quantile(size, np.linspace(0, 1, _SIZE_BINS + 1))
+    bins = np.clip(np.searchsorted(edges, size, side="right") - 1, 0, _SIZE_BINS - 1)
+    centers = np.array([size[bins == b].mean() for b in range(_SIZE_BINS)])
+    sigmas = np.array([np.percentile(error[bins == b], _NORMAL_68) for b in range(_SIZE_BINS)])
     slope, floor = np.polyfit(centers, sigmas, 1)
     return round(float(max(floor, 0.3)), 4), round(float(max(slope, 0.0)), 5)
 

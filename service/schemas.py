@@ -28,7 +28,8 @@ _RFC3339 = re.compile(
 
 
 class _Message(BaseModel):
-    model_config = ConfigDict(extra="forbid", populate_by_name=True, use_attribute_docstrings=True)
+    # Fields may be added to the contract: a client of today must read the messages of tomorrow.
+    model_config = ConfigDict(extra="ignore", populate_by_name=True, use_attribute_docstrings=True)
 
 
 class Box(_Message):

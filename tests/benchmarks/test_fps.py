@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 from benchmarks.clip_sets import clip_frame_sets
 from benchmarks.fps import Via, bench_fps, run_inproc
 from benchmarks.measured import Measured
-from benchmarks.served import Served
 from service.nets.pack import load_pack
 from service.pipeline import Pipeline
 from service.scheduler import Scheduler
@@ -63,15 +62,6 @@ def test_every_set_of_a_closed_loop_is_answered() -> None:
         scheduler.stop()
     assert measured.sets == len(measured.latency_ms) > 0
     assert measured.dropped == 0
-
-
-def test_the_served_process_ends_with_its_context() -> None:
-    sets = clip_frame_sets()
-    with Served("edge", sets[0].site, workers=1) as served, served.client() as client:
-        message = client.detect(sets[0].site.id, {f.camera_id: f.data for f in sets[0].frames})
-        process = served.process
-    assert len(message.cameras) == len(sets[0].frames)
-    assert process.poll() is not None
 
 
 def test_via_names_its_ways() -> None:

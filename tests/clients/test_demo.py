@@ -15,10 +15,11 @@ from typing import Any
 
 import pytest
 
-from clients import demo
+from clients import demo, local_service
 from clients.client import Client, ServiceError
 from clients.clip import SHIPPED, open_clip
 from clients.demo import DemoError, Progress, replay
+from clients.local_service import LocalServiceError
 from service.schemas import Detections, Timing
 
 
@@ -95,13 +96,16 @@ def test_a_taken_port_gives_way_to_a_free_one() -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        assert demo.free_port(port) not in (0, port)
+        assert local_service.free_port(port) not in (0, port)
 
 
 def test_a_service_that_does_not_start_says_why(tmp_path: Path) -> None:
     broken = tmp_path / "site.json"
     broken.write_text('{"id": "no good"}')
-    with pytest.raises(DemoError, match=r"(?s)did not start.*site\.json"), demo.running_service(broken, free_port()):
+    with (
+        pytest.raises(LocalServiceError, match=r"(?s)did not start.*site\.json"),
+        local_service.running_service(broken, free_port()),
+    ):
         pytest.fail("a service came up on a broken site")
 
 

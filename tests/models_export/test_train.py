@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -102,4 +103,4 @@ def test_the_learning_rate_warms_up_and_decays() -> None:
     rates = [learning_rate(config, step) for step in range(1000)]
     assert rates[0] < rates[99] <= config.learning_rate
     assert rates[-1] == pytest.approx(0.02 * config.learning_rate, rel=0.05)
-    assert all(a >= b for a, b in zip(rates[100:], rates[101:], strict=False))
+    assert all(a >= b for a, b in itertools.pairwise(rates[100:]))

@@ -12,7 +12,7 @@ from service.errors import PackError
 from service.nets.pack import MODELS_DIR, Pack, load_pack
 
 
-@pytest.fixture()
+@pytest.fixture
 def pack_copy(tmp_path: Path) -> Path:
     return Path(shutil.copytree(MODELS_DIR / "edge", tmp_path / "edge"))
 
@@ -80,7 +80,7 @@ def test_a_file_that_is_no_model_is_refused(pack_copy: Path) -> None:
 
 def test_a_manifest_that_leads_out_of_its_folder_is_refused(pack_copy: Path) -> None:
     edit_manifest(pack_copy, file="../detector.onnx")
-    with pytest.raises(PackError, match="networks.detector.file"):
+    with pytest.raises(PackError, match=r"networks\.detector\.file"):
         load_pack(str(pack_copy))
 
 
