@@ -12,8 +12,8 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
 
-QUANTIZED_OPS = ["Conv", "Add", "Resize", "MatMul"]
-"""Operators that run in int8; all others stay in float."""
+QUANTIZED_OPS = ["Conv", "Relu", "Add", "Resize", "MatMul", "Gemm"]
+"""Operators that run in int8; all others stay in float. Relu is among them so that chains of convolutions stay in int8."""
 
 
 class _Calibration(CalibrationDataReader):
