@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -29,7 +30,7 @@ from models_export.validate import (
     depth_scores,
     detect_all,
     detector_scores,
-    edge_sigma_fit,
+    edge_errors,
     image_of,
     match_all,
     multibin_scores,
@@ -49,9 +50,9 @@ _PARITY_IMAGES = 4
 _OUTPUTS = {"detector": ("p8", "p16", "p32"), "multibin": ("vectors", "confidence", "residual"), "depth": ("inverse_depth",)}
 # Stand in the metadata only until validation has measured the real ones.
 _SIGMA_UNKNOWN: dict[str, Any] = {
-    "edge_px": [1.0, 0.02],
-    "dims_lwh": [0.2, 0.08, 0.08],
-    "alpha_rad": 0.07,
+    "edge_px": [1.0, 0.02, 0.0, 1.0],
+    "dims_lwh": [[0.3, 0.0, 0.0, 1.0], [0.1, 0.0, 0.0, 1.0], [0.1, 0.0, 0.0, 1.0]],
+    "alpha_rad": [0.07, 0.0, 0.0, 1.0],
     "depth_relative": 0.1,
 }
 
@@ -104,7 +105,7 @@ def export(runs: Path, data: Sequence[Path], out: Path, recipe: EdgeRecipe, cons
     training, validation = split_scenes(data)
     job = _Job.load(runs, training, validation, recipe)
     detector, found = job.detector()
-    networks = [detector, job.multibin(found), job.depth()]
+    networks = [detector, job.multibin(found), job.depth(found)]
     for name in NETWORKS:
         console.print(name, job.scores[name])
     provenance = {
@@ -149,7 +150,7 @@ class _Job:
         model = to_onnx(net, "detector", (192, config.max_width), _OUTPUTS["detector"], dynamic_hw=True)
         model = self._checked(net, "detector", model, metadata, _image_batches(self.samples), self._calibration_canvases())
         found = detect_all(Detector(open_network("detector", with_metadata(model, metadata))), self.samples)
-        metadata["sigma_edge_px"] = list(edge_sigma_fit(match_all(found, self.samples)))
+        metadata["sigma_edge_px"] = edge_errors(match_all(found, self.samples)).to_metadata()
         self.scores["detector"] |= detector_scores(found, self.samples) | {"sigma_edge_px": metadata["sigma_edge_px"]}
         return self._exported("detector", model, metadata, net), found
 
@@ -174,14 +175,22 @@ class _Job:
         self.scores["multibin"] |= measured
         return self._exported("multibin", model, metadata, net)
 
-    def depth(self) -> Exported:
+    def depth(self, found: list[Detections]) -> Exported:
         self._checkpoint("depth")
-        net = self._weights("depth", EdgeDepth(self.recipe.depth))
-        metadata: dict[str, Any] = {"stride": self.recipe.depth.stride, "sigma_relative": _SIGMA_UNKNOWN["depth_relative"]}
-        model = to_onnx(net, "depth", (192, self.recipe.detector.max_width), _OUTPUTS["depth"], dynamic_hw=True)
+        net = EdgeDepth(self.recipe.depth)
+        self._weights("depth", net)
+        metadata: dict[str, Any] = {
+            "stride": self.recipe.depth.stride,
+            "bias_relative": 0.0,
+            "sigma_relative": _SIGMA_UNKNOWN["depth_relative"],
+        }
+        model = to_onnx(
+            net.with_folded_pooling(), "depth", (192, self.recipe.detector.max_width), _OUTPUTS["depth"], dynamic_hw=True
+        )
         model = self._checked(net, "depth", model, metadata, _image_batches(self.samples), self._calibration_canvases())
-        measured = depth_scores(DepthNet(open_network("depth", with_metadata(model, metadata))), self.samples)
-        metadata["sigma_relative"] = measured["abs_rel"]
+        ours = DepthNet(open_network("depth", with_metadata(model, metadata)))
+        measured = depth_scores(ours, self.samples, match_all(found, self.samples))
+        metadata |= {key: measured[key] for key in ("bias_relative", "sigma_relative")}
         self.scores["depth"] |= measured
         return self._exported("depth", model, metadata, net)
 
@@ -243,5 +252,12 @@ def _data_description(root: Path) -> dict[str, Any]:
         "source": "simulator (models_export.scenes), generated data, no third-party images",
         "generators": sorted({str(scene["generator"]) for scene in scenes}),
         "worlds": sorted({str(scene["world"]) for scene in scenes}),
-        "seeds": sorted({int(scene["seed"]) for scene in scenes}),
+        "seeds": _ranges(sorted({int(scene["seed"]) for scene in scenes})),
     }
+
+
+def _ranges(numbers: list[int]) -> list[str]:
+    """Rising numbers as ``first-last`` of each run without gaps."""
+    breaks = [i for i in range(1, len(numbers)) if numbers[i] != numbers[i - 1] + 1]
+    runs = [numbers[a:b] for a, b in itertools.pairwise([0, *breaks, len(numbers)])]
+    return [f"{run[0]}-{run[-1]}" for run in runs if run]

@@ -6,27 +6,33 @@ The sigmas measured here go into the ONNX metadata: lifting weighs each reading 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from models_export.data.samples import Sample
+from service.depth_scale import DepthScale, fit_scale, ground_inverse_depth, read_boxes
 from service.errors import InputError
+from service.geometry.boxes import cut_edges
 from service.geometry.camera import ray_azimuth
 from service.geometry.iou import iou_2d
 from service.geometry.transforms import Array, wrap_angle
-from service.nets.depth import DepthNet
-from service.nets.detector import Detections, Detector
+from service.nets.depth import UNBIASED, DepthNet, InverseDepth
+from service.nets.detector import Detections, Detector, box_size
+from service.nets.error_model import ErrorModel
 from service.nets.multibin import Multibin, crop_vehicles
 
 SCORE_FLOOR = 0.05
 """Detections below do not enter the precision-recall curve."""
-MATCH_IOU = 0.6
+MATCH_IOU = 0.5
 """Detections that overlap a vehicle by more measure edges, angles and sizes."""
 _NORMAL_68 = 68.27
-_SIZE_BINS = 8
+_SCORE_BINS, _SIZE_BINS = 8, 4
+_MIN_ERRORS = 4 * _SCORE_BINS * _SIZE_BINS
+_MIN_CUT = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +42,8 @@ class Matched:
     sample: Sample
     xyxy_px: Array
     """(M, 4) detected boxes."""
+    score: Array
+    """(M,)"""
     truth: NDArray[np.int64]
     """(M,) rows of the sample's vehicles."""
 
@@ -59,7 +67,7 @@ def match_all(detections: Sequence[Detections], samples: Sequence[Sample], min_s
         truth = overlap.argmax(1) if overlap.size else np.zeros(len(found), np.int64)
         good = overlap.max(1, initial=0.0) > MATCH_IOU
         good &= (found.score > min_score) & ~sample.ignore[truth] if len(sample.ignore) else False
-        matches.append(Matched(sample, found.xyxy_px[good], truth[good]))
+        matches.append(Matched(sample, found.xyxy_px[good], found.score[good], truth[good]))
     return matches
 
 
@@ -96,68 +104,118 @@ def average_precision(detections: Sequence[Detections], samples: Sequence[Sample
     return round(100 * float(np.sum(np.diff(recall, prepend=0.0) * envelope)), 2)
 
 
-def edge_sigma_fit(matches: Sequence[Matched]) -> tuple[float, float]:
-    """(a, b) of sigma = a + b * sqrt(width * height), px: the 68th percentile of edge errors in bins of box size.
+def fit_error_model(error: Array, score: Array, is_cut: NDArray[np.bool_], size: Array | None = None) -> ErrorModel:
+    """The error model of absolute errors (N,) on detections of scores (N,), cut or not (N,), of sizes (N,).
 
-    Raises InputError when there are too few matches to measure anything.
+    Fitted to the 68th percentile of the errors in bins of score (and size), which a few gross errors do not move. Raises
+    InputError when there are too few errors to measure anything.
     """
-    sizes, errors = [], []
-    for m in matches:
-        truth = m.sample.xyxy_px[m.truth]
-        sizes.append(np.repeat(np.sqrt(np.prod(truth[:, 2:] - truth[:, :2], axis=1)), 4))
-        errors.append(np.abs(m.xyxy_px - truth).reshape(-1))
-    size, error = np.concatenate(sizes or [np.zeros(0)]), np.concatenate(errors or [np.zeros(0)])
-    if len(size) < _SIZE_BINS:
+    whole = np.flatnonzero(~is_cut)
+    if len(whole) < _MIN_ERRORS:
         raise InputError(
             "the detector finds next to nothing on the validation scenes.", field="detector", remedy="Train it longer."
         )
-    edges = np.quantile(size, np.linspace(0, 1, _SIZE_BINS + 1))
-    bins = np.clip(np.searchsorted(edges, size, side="right") - 1, 0, _SIZE_BINS - 1)
-    centers = np.array([size[bins == b].mean() for b in range(_SIZE_BINS)])
-    sigmas = np.array([np.percentile(error[bins == b], _NORMAL_68) for b in range(_SIZE_BINS)])
-    slope, floor = np.polyfit(centers, sigmas, 1)
-    return round(float(max(floor, 0.3)), 4), round(float(max(slope, 0.0)), 5)
+    sizes = np.zeros_like(error) if size is None else size
+    rows = []
+    for by_score in np.array_split(whole[np.argsort(score[whole])], _SCORE_BINS):
+        for part in np.array_split(by_score[np.argsort(sizes[by_score])], 1 if size is None else _SIZE_BINS):
+            rows.append((score[part].mean(), sizes[part].mean(), np.percentile(error[part], _NORMAL_68)))
+    scores, means, sigmas = np.array(rows).T
+
+    def misfit(parameters: Array) -> Array:
+        floor, slope, growth = parameters
+        misfits: Array = np.log((floor + slope * means) * np.exp(growth * (1 - scores))) - np.log(np.maximum(sigmas, 1e-6))
+        return misfits
+
+    slope_limit = 1e-9 if size is None else np.inf
+    start = [float(np.median(sigmas)), min(1e-3, slope_limit / 2), 1.0]
+    floor, slope, growth = least_squares(misfit, start, bounds=([1e-6, 0.0, 0.0], [np.inf, slope_limit, 10.0])).x
+    model = ErrorModel(round(float(floor), 6), round(float(slope), 6), round(float(growth), 4), 1.0)
+    if is_cut.sum() < _MIN_CUT:
+        return model
+    excess = error[is_cut] / model.sigma(score[is_cut], False, sizes[is_cut])
+    return replace(model, cut=round(max(float(np.percentile(excess, _NORMAL_68)), 1.0), 3))
+
+
+def edge_errors(matches: Sequence[Matched]) -> ErrorModel:
+    """The error model of box edges, px. Edges at the border itself are left out: lifting does not read them."""
+    error, score, is_cut, size = [], [], [], []
+    for m in matches:
+        at_border = cut_edges(m.sample.camera, m.xyxy_px)
+        inner = ~at_border
+        error.append(np.abs(m.xyxy_px - m.sample.xyxy_px[m.truth])[inner])
+        score.append(np.repeat(m.score[:, None], 4, 1)[inner])
+        is_cut.append(np.repeat(at_border.any(1)[:, None], 4, 1)[inner])
+        size.append(np.repeat(box_size(m.xyxy_px)[:, None], 4, 1)[inner])
+    return fit_error_model(np.concatenate(error), np.concatenate(score), np.concatenate(is_cut), np.concatenate(size))
 
 
 def multibin_scores(multibin: Multibin, matches: Sequence[Matched]) -> dict[str, Any]:
-    """Errors of angle and size on detected boxes: medians, flips, and the sigmas that lifting uses."""
-    angle, size, flipped = [], [], []
+    """Errors of angle and size on detected boxes: medians, flips, and the error models that lifting uses."""
+    angle, size, flipped = [np.zeros(0)], [np.zeros((0, 3))], [np.zeros(0, dtype=bool)]
     for m in matches:
-        if not len(m.truth):
-            continue
-        image, sample = image_of(m.sample), m.sample
-        estimate = multibin.estimate(crop_vehicles(image, m.xyxy_px, multibin.spec.crop_px), sample.cls[m.truth])
-        truth_boxes = sample.xyxy_px[m.truth]
-        heading = sample.alpha[m.truth] + ray_azimuth(sample.camera, (truth_boxes[:, :2] + truth_boxes[:, 2:]) / 2)
-        ours = estimate.alpha + ray_azimuth(sample.camera, (m.xyxy_px[:, :2] + m.xyxy_px[:, 2:]) / 2)
-        error = wrap_angle(ours - heading)
+        sample = m.sample
+        estimate = multibin.estimate(crop_vehicles(image_of(sample), m.xyxy_px, multibin.spec.crop_px), sample.cls[m.truth])
+        heading = sample.alpha[m.truth] + _azimuth(sample, sample.xyxy_px[m.truth])
+        error = wrap_angle(estimate.alpha + _azimuth(sample, m.xyxy_px) - heading)
         flip = np.abs(error) > np.pi / 2
         flipped.append(flip)
         angle.append(np.abs(wrap_angle(error + np.pi * flip)))
         size.append(estimate.dims_lwh - sample.dims_lwh[m.truth])
-    angles, sizes = np.concatenate(angle), np.concatenate(size)
+    angles, sizes, score = np.concatenate(angle), np.concatenate(size), np.concatenate([m.score for m in matches])
+    is_cut = np.concatenate([cut_edges(m.sample.camera, m.xyxy_px).any(1) for m in matches])
     return {
         "vehicles": len(angles),
         "angle_median_deg": round(float(np.degrees(np.median(angles))), 3),
         "angle_p90_deg": round(float(np.degrees(np.percentile(angles, 90))), 3),
         "flips_percent": round(100 * float(np.mean(np.concatenate(flipped))), 3),
         "size_rmse_lwh_m": np.sqrt((sizes**2).mean(0)).round(4).tolist(),
-        "sigma_alpha_rad": round(float(np.percentile(angles, _NORMAL_68)), 5),
-        "sigma_dims_lwh": np.percentile(np.abs(sizes), _NORMAL_68, axis=0).round(4).tolist(),
+        "sigma_alpha_rad": fit_error_model(angles, score, is_cut).to_metadata(),
+        "sigma_dims_lwh": [fit_error_model(np.abs(sizes[:, axis]), score, is_cut).to_metadata() for axis in range(3)],
     }
 
 
-def depth_scores(depth: DepthNet, samples: Sequence[Sample]) -> dict[str, float]:
-    """Absolute relative depth error after the least-squares scale and shift of each image, and the share within 25 %."""
-    errors, within = [], []
-    for sample in samples:
-        ours = depth.infer([image_of(sample)])[0].values.astype(np.float64)
-        truth = sample.inverse_depth[: ours.shape[0], : ours.shape[1]].astype(np.float64)
+def _azimuth(sample: Sample, xyxy_px: Array) -> Array:
+    return ray_azimuth(sample.camera, (xyxy_px[:, :2] + xyxy_px[:, 2:]) / 2)
+
+
+def depth_scores(depth: DepthNet, samples: Sequence[Sample], matches: Sequence[Matched]) -> dict[str, float]:
+    """Errors of the depth net.
+
+    ``abs_rel`` and ``delta_1.25`` (percent) over all cells after the least-squares scale and shift of each image;
+    ``bias_relative`` and ``sigma_relative``: median relative error of what the service reads in detected boxes, with the scale
+    that it fits on the road, and the 68th percentile about it. The map blurs a vehicle into the road behind it.
+    """
+    errors, within, readings = [], [], [np.zeros(0)]
+    for sample, m in zip(samples, matches, strict=True):
+        ours = depth.infer([image_of(sample)])[0]
+        truth = sample.inverse_depth[: ours.values.shape[0], : ours.values.shape[1]]
         known = truth > 0
-        design = np.stack([ours[known], np.ones(known.sum())], 1)
-        (scale, shift), *_ = np.linalg.lstsq(design, truth[known], rcond=None)
-        inverse = np.maximum(scale * ours[known] + shift, 1 / 200)
-        ratio = truth[known] / inverse
+        ratio = truth[known] / np.maximum(_aligned(ours.values[known], truth[known]), 1 / 200)
         errors.append(float(np.mean(np.abs(ratio - 1))))
         within.append(float(np.mean(np.maximum(ratio, 1 / ratio) < 1.25)))
-    return {"abs_rel": round(float(np.mean(errors)), 4), "delta_1.25": round(100 * float(np.mean(within)), 2)}
+        readings.append(_reading_errors(ours, truth, sample, m))
+    every = np.concatenate(readings)
+    bias = float(np.median(every)) if len(every) else 0.0
+    return {
+        "abs_rel": round(float(np.mean(errors)), 4),
+        "delta_1.25": round(100 * float(np.mean(within)), 2),
+        "bias_relative": round(bias, 4),
+        "sigma_relative": round(float(np.percentile(np.abs((1 + every) / (1 + bias) - 1), _NORMAL_68)), 4),
+    }
+
+
+def _aligned(ours: NDArray[np.float32], truth: NDArray[np.float32]) -> Array:
+    design = np.stack([ours.astype(np.float64), np.ones(len(ours))], 1)
+    solution, *_ = np.linalg.lstsq(design, truth.astype(np.float64), rcond=None)
+    aligned: Array = design @ solution
+    return aligned
+
+
+def _reading_errors(ours: InverseDepth, truth: NDArray[np.float32], sample: Sample, m: Matched) -> Array:
+    """Relative errors of the readings of one sample's detected boxes."""
+    ground = ground_inverse_depth(sample.camera, sample.ground, ours.values.shape, ours.stride)
+    read = read_boxes(ours, fit_scale(ours.values, ground), m.xyxy_px, UNBIASED).depth_m
+    exact = read_boxes(InverseDepth(truth, ours.stride), DepthScale(1.0, 0.0, 0.0), m.xyxy_px, UNBIASED).depth_m
+    error = read / exact - 1
+    return error[np.isfinite(error)]

@@ -49,8 +49,9 @@ class FusionSettings:
     """What surveying and pose leave open near the camera, metres (one sigma)."""
     calibration_sigma_rad: float = 0.003
     """What the camera's orientation leaves open: metres a metre of distance."""
-    duplicate_iou: float = 0.3
-    """Bird's-eye IoU above which two boxes are one vehicle: solid bodies do not overlap."""
+    duplicate_iou: float = 0.1
+    """Bird's-eye IoU above which two boxes are one vehicle: solid bodies do not overlap. Cars in adjacent lanes that are both
+    0.85 m off towards each other reach it."""
     duplicate_distance_m: float = 1.0
     """Centres nearer than this are one vehicle, metres."""
     single_view_factor: float = 0.85

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.geometry.boxes import STATE_DIM, Boxes, box_corners
+from service.geometry.boxes import BORDER_PX, STATE_DIM, Boxes, box_corners
 from service.geometry.camera import MIN_DEPTH_M, Camera
 from service.geometry.ground import GroundPlane
 from service.geometry.transforms import Array, transform_points, wrap_angle
@@ -70,7 +70,7 @@ class LiftSettings:
     """How far a wheel may stand above or below the ground plane, metres (one sigma)."""
     ground_sigma_per_m: float = 0.003
     """What a metre of distance adds to it: roads are not planes, poses not exact."""
-    border_px: float = 2.0
+    border_px: float = BORDER_PX
     """An edge this near to the image border is taken as cut by it."""
     huber_sigmas: float = 2.0
     """Edges and depths off by more than this count linearly: occlusion, a depth read off another object."""

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +15,7 @@ from service.depth_scale import DepthReadings, DepthScales, read_boxes
 from service.errors import FrameError
 from service.frames import FrameSet, decode
 from service.fusion import FusionSettings, fuse
-from service.geometry.boxes import Boxes, clip_extents
+from service.geometry.boxes import Boxes, clip_extents, cut_edges
 from service.geometry.camera import Camera, UInt8Image, yaw_from_alpha
 from service.lifting import LiftSettings, Measurements, lift
 from service.nets.canvas import canvas_size
@@ -34,6 +35,9 @@ class PipelineSettings:
     """2D boxes that overlap a better one by more are dropped."""
     min_fused_score: float = 0.3
     """Fused boxes of a lower score are dropped."""
+    max_position_sigma_m: float = 1.2
+    """Fused boxes whose place on the road is less certain (one sigma, both axes together) are dropped: mostly vehicles that one
+    camera alone sees, from far away, often beside their own box from the other cameras. ``per_camera`` has them."""
     lift: LiftSettings = field(default_factory=LiftSettings)
     fusion: FusionSettings = field(default_factory=FusionSettings)
 
@@ -70,6 +74,8 @@ class Pipeline:
         self.multibin = Multibin(pack.networks["multibin"])
         self.depth = DepthNet(pack.networks["depth"])
         self._scales = DepthScales()
+        # Whole frame sets run side by side; threads inside OpenCV would only fight them for the same cores.
+        cv2.setNumThreads(1)
 
     def warm_up(self) -> None:
         """Run every network once at the paper's frame size, so that the first request pays no set-up."""
@@ -98,7 +104,7 @@ class Pipeline:
             lifted = lift(cameras, frame_set.site.ground, measurements, self.settings.lift)
         with _timed(timing, "fuse"):
             fused = fuse(lifted, measurements.camera_index, cameras, self.settings.fusion)
-            keep = fused.boxes.score >= self.settings.min_fused_score
+            keep = self._reported(fused.boxes)
         timing["total"] = 1e3 * (time.perf_counter() - started)
         return SetResult(
             boxes=fused.boxes.take(keep),
@@ -110,6 +116,10 @@ class Pipeline:
             timing_ms=timing,
             failed=failed,
         )
+
+    def _reported(self, boxes: Boxes) -> NDArray[np.bool_]:
+        sigma = np.sqrt(boxes.covariance[:, 0, 0] + boxes.covariance[:, 1, 1])
+        return (boxes.score >= self.settings.min_fused_score) & (sigma <= self.settings.max_position_sigma_m)
 
     def _decode(self, frame_set: FrameSet) -> tuple[list[Camera], list[UInt8Image], dict[str, FrameError]]:
         """Images, and the cameras at the images' sizes."""
@@ -138,7 +148,7 @@ class Pipeline:
         parts = []
         for camera, inverse, detections in zip(cameras, self.depth.infer(images), found, strict=True):
             scale = self._scales.update(frame_set.site.camera(camera.id), camera, frame_set.site.ground, inverse)
-            parts.append(read_boxes(inverse, scale, detections.xyxy_px, self.depth.sigma_relative))
+            parts.append(read_boxes(inverse, scale, detections.xyxy_px, self.depth.reading))
         return DepthReadings(np.concatenate([p.depth_m for p in parts]), np.concatenate([p.sigma_m for p in parts]))
 
     def _measurements(
@@ -147,21 +157,23 @@ class Pipeline:
         index = np.repeat(np.arange(len(cameras)), [len(detections) for detections in found])
         xyxy = np.concatenate([clip_extents(camera, d.xyxy_px) for camera, d in zip(cameras, found, strict=True)])
         centers = (xyxy[:, :2] + xyxy[:, 2:]) / 2
-        yaw = np.zeros(len(index))
+        yaw, is_cut = np.zeros(len(index)), np.zeros(len(index), dtype=bool)
         for row, camera in enumerate(cameras):
             own = index == row
             yaw[own] = yaw_from_alpha(camera, estimates.alpha[own], centers[own])
+            is_cut[own] = cut_edges(camera, xyxy[own]).any(1)
         spec = self.multibin.spec
+        score = np.concatenate([d.score for d in found])
         return Measurements(
             camera_index=index,
             xyxy_px=xyxy,
-            sigma_px=edge_sigma(self.detector.spec, xyxy),
+            sigma_px=edge_sigma(self.detector.spec, xyxy, score, is_cut),
             dims_lwh=estimates.dims_lwh,
-            sigma_dims=np.tile(spec.sigma_dims_lwh, (len(index), 1)),
+            sigma_dims=np.stack([model.sigma(score, is_cut) for model in spec.sigma_dims_lwh], 1),
             yaw=yaw,
-            sigma_yaw=np.full(len(index), spec.sigma_alpha_rad),
+            sigma_yaw=spec.sigma_alpha_rad.sigma(score, is_cut),
             flip_log_odds=estimates.flip_log_odds,
-            score=np.concatenate([d.score for d in found]),
+            score=score,
             cls=np.concatenate([d.cls for d in found]),
             depth_m=readings.depth_m,
             sigma_depth_m=readings.sigma_m,

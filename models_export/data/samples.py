@@ -15,6 +15,7 @@ from service.errors import InputError
 from service.frames import decode
 from service.geometry.boxes import clip_extents, project_extents
 from service.geometry.camera import Camera, ray_azimuth
+from service.geometry.ground import GroundPlane
 from service.geometry.transforms import Array, wrap_angle
 from service.nets.canvas import to_canvas
 
@@ -54,6 +55,8 @@ class Sample:
     """(N,) visible fraction."""
     truncated: Array
     """(N,) fraction outside the image."""
+    ground: GroundPlane
+    """The scene's road."""
     inverse_depth: NDArray[np.float32]
     """(h, w) 1 / metres at the depth net's stride; 0 where the depth is unknown."""
 
@@ -107,6 +110,7 @@ def _load_sample(
         alpha=wrap_angle(truth.yaw[seen] - ray_azimuth(scaled, (xyxy[:, :2] + xyxy[:, 2:]) / 2)),
         visible=visible,
         truncated=truncated,
+        ground=scene.site.ground,
         inverse_depth=_inverse_depth(scene.depth(camera.id, step), to_canvas(image).shape[:2], image.shape[:2], depth_stride),
     )
 

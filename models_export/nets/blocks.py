@@ -5,13 +5,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+PIXEL_SCALE, PIXEL_OFFSET = 1.0 / 127.5, 1.0
+"""Networks see ``pixel * PIXEL_SCALE - PIXEL_OFFSET``."""
+
 
 class Normalise(nn.Module):
     """uint8 NHWC pixels, 0..255, to float NCHW in -1..1; part of every exported graph."""
 
     def forward(self, images: Tensor) -> Tensor:
         """(B, H, W, 3) uint8 to (B, 3, H, W) float."""
-        return images.permute(0, 3, 1, 2).float() * (1.0 / 127.5) - 1.0
+        return images.permute(0, 3, 1, 2).float() * PIXEL_SCALE - PIXEL_OFFSET
 
 
 def conv(cin: int, cout: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:

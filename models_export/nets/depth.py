@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass
 
 import torch
@@ -85,6 +86,19 @@ class EdgeDepth(nn.Module):
         self.from16, self.from8 = nn.Conv2d(c16, d, 1), nn.Conv2d(c8, d, 1)
         self.fuse16, self.fuse8 = conv(d, d), conv(d, d)
         self.head = nn.Conv2d(d, 1, 3, padding=1)
+
+    def with_folded_pooling(self) -> EdgeDepth:
+        """A copy in which the pooling is part of the first convolution, with the same outputs: for export.
+
+        Pooling over uint8 pixels is slow where a convolution is fast. A 3x3 kernel of stride 2 over 2x2 means is a 6x6 kernel
+        of stride 4 whose taps are a quarter each.
+        """
+        folded = deepcopy(self)
+        first = folded.stem4[1][0]
+        wide = nn.Conv2d(first.in_channels, first.out_channels, 6, 4, 2, bias=False)
+        wide.weight = nn.Parameter(first.weight.detach().repeat_interleave(2, 2).repeat_interleave(2, 3) / 4)
+        folded.stem4[0], folded.stem4[1][0] = nn.Identity(), wide
+        return folded
 
     def forward(self, images: Tensor) -> Tensor:
         """H and W are multiples of 32."""

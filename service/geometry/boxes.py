@@ -17,6 +17,9 @@ from service.geometry.transforms import Array, transform_points
 CORNER_SIGNS = np.array([[sx, sy, sz] for sz in (-1, 1) for sx, sy in ((1, 1), (-1, 1), (-1, -1), (1, -1))], dtype=np.float64)
 """Signs (8, 3) of the corners over (length, width, height): bottom four first, counter-clockwise seen from above."""
 
+BORDER_PX = 2.0
+"""An edge of a 2D box this near to the image border counts as cut by it."""
+
 STATE_DIM = 7
 """x, y, z, length, width, height, yaw."""
 
@@ -93,6 +96,13 @@ def project_extents(camera: Camera, center: ArrayLike, dims_lwh: ArrayLike, yaw:
     pixels = camera.project_cam(corners_cam)
     in_front = np.all(corners_cam[..., 2] > MIN_DEPTH_M, axis=-1)
     return np.concatenate([pixels.min(axis=-2), pixels.max(axis=-2)], -1), in_front
+
+
+def cut_edges(camera: Camera, xyxy_px: ArrayLike, border_px: float = BORDER_PX) -> NDArray[np.bool_]:
+    """Which edges (N, 4: left, top, right, bottom) of 2D boxes (N, 4) lie at the image border, and so are cut by it."""
+    xyxy = np.asarray(xyxy_px, dtype=np.float64)
+    limits = np.array([camera.width - 1, camera.height - 1], dtype=np.float64)
+    return np.concatenate([xyxy[:, :2] <= border_px, xyxy[:, 2:] >= limits - border_px], 1)
 
 
 def clip_extents(camera: Camera, xyxy: ArrayLike) -> Array:

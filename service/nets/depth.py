@@ -23,16 +23,29 @@ class InverseDepth:
     """Pixels of the image a cell."""
 
 
+@dataclass(frozen=True)
+class ReadingError:
+    """Relative error of a depth read in a detected box, measured on validation scenes."""
+
+    bias: float
+    """Median of (reading - truth) / truth: the map blurs a vehicle into the road behind it."""
+    sigma: float
+    """Standard deviation about the bias."""
+
+
+UNBIASED = ReadingError(0.0, 0.0)
+
+
 class DepthNet:
     """The depth net of a pack.
 
-    ``sigma_relative`` is the standard deviation of its depth over the depth, measured on validation scenes.
+    ``stride`` is the image's pixels a cell; ``reading`` how far off readings in detected boxes are.
     """
 
     def __init__(self, network: Network) -> None:
         try:
             self.stride = int(network.metadata["stride"])
-            self.sigma_relative = float(network.metadata["sigma_relative"])
+            self.reading = ReadingError(float(network.metadata["bias_relative"]), float(network.metadata["sigma_relative"]))
         except (KeyError, TypeError, ValueError) as error:
             raise PackError(f"metadata is incomplete: {error!r}.", field="depth", remedy="Export the pack again.") from error
         self.network = network

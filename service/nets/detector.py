@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from service.errors import PackError
 from service.geometry.transforms import Array
 from service.nets.canvas import batches
+from service.nets.error_model import ErrorModel
 from service.nets.pack import Network
 
 MAX_CANDIDATES = 300
@@ -30,8 +31,8 @@ class DetectorSpec:
     """Per stride, (width, height) of each anchor in px."""
     max_width: int
     """Images are decoded to at most this width, px."""
-    sigma_edge_px: tuple[float, float]
-    """Standard deviation of a box edge: a + b * sqrt(box width * height), px; measured on validation scenes."""
+    sigma_edge_px: ErrorModel
+    """Of each edge of a box, px."""
 
     @staticmethod
     def from_metadata(metadata: dict[str, object]) -> DetectorSpec:
@@ -42,7 +43,7 @@ class DetectorSpec:
                 strides=tuple(metadata["strides"]),  # type: ignore[arg-type]
                 anchors_px=tuple(tuple((float(w), float(h)) for w, h in scale) for scale in metadata["anchors_px"]),  # type: ignore[attr-defined]
                 max_width=int(metadata["max_width"]),  # type: ignore[call-overload]
-                sigma_edge_px=tuple(metadata["sigma_edge_px"]),  # type: ignore[arg-type]
+                sigma_edge_px=ErrorModel.from_metadata(metadata["sigma_edge_px"]),
             )
         except (KeyError, TypeError, ValueError) as error:
             raise PackError(f"metadata is incomplete: {error!r}.", field="detector", remedy="Export the pack again.") from error
@@ -123,9 +124,13 @@ def suppress(detections: Detections, nms_iou: float) -> Detections:
     return Detections(detections.xyxy_px[keep], detections.score[keep], detections.cls[keep])
 
 
-def edge_sigma(spec: DetectorSpec, xyxy_px: ArrayLike) -> Array:
-    """Standard deviations (N, 4) of the edges of boxes (N, 4), px."""
+def box_size(xyxy_px: ArrayLike) -> Array:
+    """Sizes (N,) of boxes (N, 4): sqrt(width * height), px, at least 1."""
     xyxy = np.asarray(xyxy_px, dtype=np.float64)
-    size = np.sqrt(np.maximum(np.prod(xyxy[:, 2:] - xyxy[:, :2], axis=1), 1.0))
-    floor, slope = spec.sigma_edge_px
-    return np.repeat((floor + slope * size)[:, None], 4, axis=1)
+    size: Array = np.sqrt(np.maximum(np.prod(xyxy[:, 2:] - xyxy[:, :2], axis=1), 1.0))
+    return size
+
+
+def edge_sigma(spec: DetectorSpec, xyxy_px: ArrayLike, score: ArrayLike, is_cut: ArrayLike) -> Array:
+    """Standard deviations (N, 4) of the edges of boxes (N, 4) with scores (N,), cut by the border or not (N,), px."""
+    return np.repeat(spec.sigma_edge_px.sigma(score, is_cut, box_size(xyxy_px))[:, None], 4, axis=1)

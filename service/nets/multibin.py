@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from service.errors import PackError
 from service.geometry.transforms import Array, wrap_angle
 from service.nets.canvas import PAD_VALUE
+from service.nets.error_model import ErrorModel
 from service.nets.pack import Network
 
 CONTEXT = 1.2
@@ -26,10 +27,10 @@ class MultibinSpec:
     """(B,) centres of the overlapping bins of alpha."""
     mean_dims_lwh: Array
     """(C, 3) mean length, width, height a class, metres: the size priors."""
-    sigma_dims_lwh: Array
-    """(3,) standard deviation of the size estimate, metres; measured on validation scenes."""
-    sigma_alpha_rad: float
-    """Standard deviation of the angle, flips aside; measured on validation scenes."""
+    sigma_dims_lwh: tuple[ErrorModel, ...]
+    """Of length, width and height, metres."""
+    sigma_alpha_rad: ErrorModel
+    """Of the angle, flips aside, radians."""
 
     @staticmethod
     def from_metadata(metadata: dict[str, object]) -> MultibinSpec:
@@ -39,8 +40,8 @@ class MultibinSpec:
                 crop_px=int(metadata["crop_px"]),  # type: ignore[call-overload]
                 bin_centers_rad=np.array(metadata["bin_centers_rad"], dtype=np.float64),
                 mean_dims_lwh=np.array(metadata["mean_dims_lwh"], dtype=np.float64).reshape(-1, 3),
-                sigma_dims_lwh=np.array(metadata["sigma_dims_lwh"], dtype=np.float64),
-                sigma_alpha_rad=float(metadata["sigma_alpha_rad"]),  # type: ignore[arg-type]
+                sigma_dims_lwh=tuple(ErrorModel.from_metadata(row) for row in metadata["sigma_dims_lwh"]),  # type: ignore[attr-defined]
+                sigma_alpha_rad=ErrorModel.from_metadata(metadata["sigma_alpha_rad"]),
             )
         except (KeyError, TypeError, ValueError) as error:
             raise PackError(f"metadata is incomplete: {error!r}.", field="multibin", remedy="Export the pack again.") from error

@@ -7,6 +7,7 @@ import pytest
 
 from models_export.data.samples import Sample
 from service.geometry.camera import Camera
+from service.geometry.ground import GroundPlane
 from service.geometry.transforms import pole_camera_pose
 
 WIDTH, HEIGHT = 160, 96
@@ -40,5 +41,6 @@ def _toy_sample(rng: np.random.Generator, camera: Camera) -> Sample:
         alpha=rng.uniform(-np.pi, np.pi, 2),
         visible=np.ones(2),
         truncated=np.zeros(2),
+        ground=GroundPlane(),
         inverse_depth=(0.02 + 0.01 * rows).astype(np.float32),
     )

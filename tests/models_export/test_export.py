@@ -26,7 +26,7 @@ METADATA = {
     "strides": list(DETECTOR.strides),
     "anchors_px": DETECTOR.anchors_px,
     "max_width": 672,
-    "sigma_edge_px": [0.5, 0.02],
+    "sigma_edge_px": [0.5, 0.02, 1.0, 1.5],
 }
 HEADS = ("p8", "p16", "p32")
 

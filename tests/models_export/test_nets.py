@@ -11,12 +11,13 @@ from models_export.nets.detector import DetectorConfig, EdgeDetector
 from models_export.nets.multibin import EdgeMultibin, MultibinConfig
 from models_export.train.detector import assign, decode, detector_loss
 from service.nets.detector import DetectorSpec, decode_heads
+from service.nets.error_model import ErrorModel
 
 CONFIG = DetectorConfig()
 
 
 def spec_of(config: DetectorConfig) -> DetectorSpec:
-    return DetectorSpec(config.classes, config.strides, config.anchors_px, config.max_width, (1.0, 0.02))
+    return DetectorSpec(config.classes, config.strides, config.anchors_px, config.max_width, ErrorModel(1.0, 0.02, 0.0, 1.0))
 
 
 def test_detector_gives_three_scales_for_any_multiple_of_32() -> None:
@@ -41,6 +42,15 @@ def test_depth_gives_an_eighth_of_any_canvas() -> None:
     net = EdgeDepth(DepthConfig()).eval()
     assert net(torch.zeros(1, 96, 160, 3, dtype=torch.uint8)).shape == (1, 12, 20)
     assert net(torch.zeros(2, 64, 96, 3, dtype=torch.uint8)).shape == (2, 8, 12)
+
+
+def test_folding_the_pooling_changes_no_output() -> None:
+    torch.manual_seed(0)
+    net = EdgeDepth(DepthConfig()).eval()
+    images = torch.randint(0, 255, (2, 96, 160, 3), dtype=torch.uint8)
+    folded = net.with_folded_pooling()
+    assert not any(isinstance(module, torch.nn.AvgPool2d) for module in folded.modules())
+    assert torch.allclose(folded.eval()(images), net(images), atol=1e-4)
 
 
 def test_networks_are_small() -> None:

@@ -7,17 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.depth_scale import DepthScales, cell_pixels, fit_scale, ground_inverse_depth, read_boxes
+from service.depth_scale import DepthScale, DepthScales, cell_pixels, fit_scale, ground_inverse_depth, read_boxes
 from service.geometry.camera import Camera
 from service.geometry.ground import GroundPlane
 from service.geometry.transforms import pole_camera_pose
-from service.nets.depth import InverseDepth
+from service.nets.depth import UNBIASED, InverseDepth, ReadingError
 
 STRIDE = 8
 SHAPE = (24, 80)
 K = np.array([[330.0, 0.0, 320.0], [0.0, 330.0, 96.0], [0.0, 0.0, 1.0]])
 CAMERA = Camera("north", 640, 192, K, pole_camera_pose([3.0, -2.0, 6.0], 0.7, 0.25))
 GROUND = GroundPlane()
+BOX = np.array([[100.0, 60.0, 140.0, 90.0]])
 
 
 def road_map(scale: float, shift: float) -> np.ndarray:
@@ -66,15 +67,22 @@ def test_boxes_read_the_surface_in_their_middle() -> None:
     values[10:16, 30:40] = 1 / 20.0
     scale = fit_scale(values, ground_inverse_depth(CAMERA, GROUND, SHAPE, STRIDE))
     boxes = np.array([[30 * 8.0, 10 * 8.0, 40 * 8.0 - 1, 16 * 8.0 - 1], [240.0, 80.0, 242.0, 81.0]])
-    readings = read_boxes(InverseDepth(values, STRIDE), scale, boxes, 0.1)
+    readings = read_boxes(InverseDepth(values, STRIDE), scale, boxes, ReadingError(0.0, 0.1))
     np.testing.assert_allclose(readings.depth_m, 20.0, rtol=0.03)
     assert np.all(readings.sigma_m >= 0.1 * readings.depth_m)
 
 
+def test_a_known_bias_is_taken_off() -> None:
+    values = np.full(SHAPE, 1 / 22.0, np.float32)
+    reading = read_boxes(InverseDepth(values, STRIDE), DepthScale(1.0, 0.0, 0.0), BOX, ReadingError(0.1, 0.05))
+    np.testing.assert_allclose(reading.depth_m, 20.0, rtol=1e-6)
+    np.testing.assert_allclose(reading.sigma_m, 1.0, rtol=1e-6)
+
+
 def test_without_a_scale_there_are_no_readings() -> None:
-    readings = read_boxes(InverseDepth(road_map(1.0, 0.0), STRIDE), None, np.zeros((3, 4)), 0.1)
+    readings = read_boxes(InverseDepth(road_map(1.0, 0.0), STRIDE), None, np.zeros((3, 4)), UNBIASED)
     assert np.isnan(readings.depth_m).all()
-    assert len(read_boxes(InverseDepth(road_map(1.0, 0.0), STRIDE), None, np.zeros((0, 4)), 0.1).depth_m) == 0
+    assert len(read_boxes(InverseDepth(road_map(1.0, 0.0), STRIDE), None, np.zeros((0, 4)), UNBIASED).depth_m) == 0
 
 
 def test_a_camera_keeps_its_scale_between_fits_and_loses_it_with_its_calibration() -> None:

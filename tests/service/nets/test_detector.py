@@ -7,8 +7,9 @@ import pytest
 
 from service.errors import PackError
 from service.nets.detector import Detections, DetectorSpec, decode_heads, edge_sigma, suppress
+from service.nets.error_model import ErrorModel
 
-SPEC = DetectorSpec(("car",), (8,), (((20.0, 10.0),),), 672, (0.5, 0.01))
+SPEC = DetectorSpec(("car",), (8,), (((20.0, 10.0),),), 672, ErrorModel(0.5, 0.01, 0.0, 3.0))
 
 
 def head(rows: int = 4, columns: int = 6) -> np.ndarray:
@@ -46,8 +47,8 @@ def test_suppression_keeps_the_better_of_two_and_both_of_strangers() -> None:
 
 
 def test_edge_sigma_grows_with_the_box() -> None:
-    sigma = edge_sigma(SPEC, [[0, 0, 10, 10], [0, 0, 100, 100]])
-    np.testing.assert_allclose(sigma, [[0.6] * 4, [1.5] * 4])
+    sigma = edge_sigma(SPEC, [[0, 0, 10, 10], [0, 0, 100, 100]], [0.9, 0.4], [False, True])
+    np.testing.assert_allclose(sigma, [[0.6] * 4, [4.5] * 4])
 
 
 def test_incomplete_metadata_is_refused() -> None:

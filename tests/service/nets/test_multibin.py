@@ -7,9 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from service.nets.error_model import ErrorModel
 from service.nets.multibin import MultibinSpec, crop_vehicles, decode_multibin
 
-SPEC = MultibinSpec(64, np.array([0.0, np.pi]), np.array([[4.4, 1.8, 1.5]]), np.array([0.2, 0.1, 0.1]), 0.07)
+SPEC = MultibinSpec(
+    64, np.array([0.0, np.pi]), np.array([[4.4, 1.8, 1.5]]), (ErrorModel(0.2, 0, 0, 1),) * 3, ErrorModel(0.07, 0, 0, 1)
+)
 
 
 @given(alpha=st.floats(-np.pi, np.pi - 1e-6), certainty=st.floats(0.1, 9.0))
