@@ -24,7 +24,7 @@ from service.geometry.camera import Camera
 from service.geometry.transforms import Array, rotation_z
 
 FILL = 0.74
-"""Share of the projection of a vehicle's box that its silhouette fills: regressed on the simulator, which draws vehicles alone."""
+"""Share of the projection of a vehicle's box that its silhouette fills: regressed on the simulator, which knows them."""
 _MARGIN_PX = 2.0
 _SLACK_M = 0.15
 _LEAST_VISIBLE = 0.001

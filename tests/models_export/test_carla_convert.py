@@ -138,9 +138,7 @@ def test_a_pole_camera_is_the_same_either_way() -> None:
     """Heading 40 degrees counter-clockwise, 15 down: in CARLA yaw -40, pitch -15."""
     pole = pole_camera_pose([5.0, 7.0, 6.0], np.deg2rad(40), np.deg2rad(15))
     pose = camera_pose(pole)
-    np.testing.assert_allclose(
-        [pose.x, pose.y, pose.z, pose.pitch, pose.yaw, pose.roll], [5, -7, 6, -15, -40, 0], atol=1e-9
-    )
+    np.testing.assert_allclose([pose.x, pose.y, pose.z, pose.pitch, pose.yaw, pose.roll], [5, -7, 6, -15, -40, 0], atol=1e-9)
 
 
 @given(yaw_deg=st.floats(-180, 180))
