@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -12,6 +14,7 @@ import pytest
 from models_export.data.carla_capture import MAX_DROPS, START_NS, CaptureRequest, Progress, capture
 from models_export.data.carla_images import intrinsics
 from models_export.data.carla_rig import parse_rig
+from models_export.data.carla_sensors import Inbox, MissingPictureError
 from models_export.data.carla_session import ServerOptions
 from models_export.data.carla_weather import PRESETS, Weather
 from models_export.data.dataset import open_scene
@@ -142,6 +145,16 @@ def test_pictures_out_of_order(captured: Captured, package: Any, new_world: Any,
     for step in range(3):
         for path in (f"boxes/{step:06d}.json", f"cameras/north/depth/{step:06d}.png", f"cameras/east/image_2/{step:06d}.jpg"):
             assert (tmp_path / "ordered" / path).read_bytes() == (tmp_path / "mixed" / path).read_bytes(), path
+
+
+def test_early_pictures_are_kept_and_old_ones_dropped() -> None:
+    inbox = Inbox("north.rgb")
+    images = {frame: SimpleNamespace(frame=frame) for frame in (5, 6, 7, 8)}
+    for frame in (7, 5, 8, 6):
+        inbox.put(images[frame])
+    assert [inbox.take(frame, time.monotonic() + 1) for frame in (6, 7, 8)] == [images[6], images[7], images[8]]
+    with pytest.raises(MissingPictureError, match="frame 5"):
+        inbox.take(5, time.monotonic())
 
 
 def test_a_missing_picture_drops_its_step_and_is_counted(captured: Captured, world: Any, tmp_path: Path) -> None:
