@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
 from rich.markup import escape
+from rich.progress import Progress
 from rich.table import Table
 
 from benchmarks.clip_score import score_clip, score_roadside
@@ -20,14 +22,19 @@ from benchmarks.kitti_protocol import CLASSES, DEFAULT_OVERLAPS, as_percent, eva
 from benchmarks.kitti_report import kitti_notes, kitti_table
 from benchmarks.machine import describe_machine
 from benchmarks.recordings import open_roadside_clip
+from benchmarks.scene_plots import write_plots
+from benchmarks.scene_report import accuracy_table, distance_table, paper_table, tracking_table
+from benchmarks.scene_score import RULES, score_scenes, settings_of, summaries
+from benchmarks.scene_sets import SceneSets, open_scene_sets
 from clients.clip import SHIPPED, ClipError
-from service.errors import QuadliftError
+from service.errors import InputError, QuadliftError
 from service.nets.pack import load_pack
 from service.pipeline import Pipeline, PipelineSettings
 
 app = typer.Typer(help="How many vehicles are found, and how exactly.", no_args_is_help=True)
-console = Console()
-notes = Console(stderr=True)
+PIPED_WIDTH = 150
+console = Console(width=None if sys.stdout.isatty() else PIPED_WIDTH)
+notes = Console(stderr=True, soft_wrap=True)
 """What is said beside the result, so that standard output stays JSON with --json."""
 
 PackOption = Annotated[str, typer.Option(help="Pack: a shipped one's name, or a folder.")]
@@ -75,6 +82,47 @@ def kitti_command(
     for note in kitti_notes(pair, curves):
         notes.print(f"[yellow]{note}[/yellow]")
     notes.print(f"{pair.frames} frames in {time.perf_counter() - started:.1f} s")
+
+
+@app.command("scenes")
+def scenes_command(
+    dataset: Annotated[Path, typer.Argument(help="Folder of scenes, or one scene's folder.")],
+    pack: PackOption = "edge",
+    cameras: Annotated[int | None, typer.Option(min=1, help="Use only the first N; each count if left out.")] = None,
+    method: Annotated[Literal["map", "paper"], typer.Option(help="How boxes are lifted and fused.")] = "map",
+    as_json: JsonOption = False,
+    plots: Annotated[Path | None, typer.Option(help="Folder for precision-recall curves and RMSE bars as PNG.")] = None,
+) -> None:
+    """Fused and single-camera boxes on scenes with exact truth: AP, position errors, tracking, by difficulty."""
+    with _errors_named():
+        settings = settings_of(method)
+        sets = open_scene_sets(dataset)
+        counts = _camera_counts(sets, cameras)
+        loaded = load_pack(pack)
+        with Progress(console=notes, transient=True) as progress:
+            task = progress.add_task("scenes", total=len(sets.scenes))
+            scores = score_scenes(sets, lambda s: Pipeline(loaded, s), settings, counts, lambda: progress.advance(task))
+        figures = summaries(scores)
+        for path in write_plots(scores, plots) if plots else []:
+            notes.print(f"wrote {path}")
+    for name, count in sorted(sets.unknown.items()):
+        notes.print(f"[yellow]{count} objects of the unknown class '{escape(name)}' skipped.[/yellow]")
+    if as_json:
+        about = {"dataset": str(dataset), "scenes": len(sets.scenes), "pack": pack, "method": method, "rules": RULES}
+        typer.echo(json.dumps({**about, "machine": describe_machine(), "difficulties": figures}, indent=1))
+        return
+    console.print(accuracy_table(figures, f"{dataset.name}: {len(sets.scenes)} scenes, pack {pack}, method {method}"))
+    for table in (distance_table(figures), tracking_table(figures), paper_table(figures)):
+        console.print(table)
+
+
+def _camera_counts(sets: SceneSets, cameras: int | None) -> list[int]:
+    """Camera counts to score. Raises InputError when no scene has as many as are asked for."""
+    if cameras is None:
+        return list(range(1, sets.most_cameras + 1))
+    if cameras > sets.most_cameras:
+        raise InputError(f"no scene has {cameras} cameras.", field="--cameras", remedy=f"The most is {sets.most_cameras}.")
+    return [cameras]
 
 
 @contextmanager
