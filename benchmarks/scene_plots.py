@@ -30,7 +30,7 @@ def write_plots(scores: Scores, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / "precision_recall.png", folder / "rmse.png"]
     for path, draw in zip(paths, (_draw_curves, _draw_rmse), strict=True):
-        figure = Figure(figsize=(9.0, 4.0), layout="constrained")
+        figure = Figure(figsize=(9.0, 4.4), layout="constrained")
         draw(figure, scores)
         figure.savefig(path, dpi=130)
     return paths
@@ -49,7 +49,7 @@ def _draw_curves(figure: Figure, scores: Scores) -> None:
                 axes.plot(_SAMPLES, curve.at(_SAMPLES), style, color=colour, label=label)
         axes.set(title=f"3D IoU > {overlap:g} (AP R40 in brackets)", xlabel="recall", xlim=(0, 1), ylim=(0, 1.02))
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=7, loc="lower left")
+        axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
     figure.axes[0].set_ylabel("precision, largest at that recall or beyond")
 
 
@@ -68,5 +68,6 @@ def _draw_rmse(figure: Figure, scores: Scores) -> None:
         axes.set_xticks(np.arange(3), ["x (East)", "y (North)", "z (up)"])
         axes.set_title("each camera alone" if single else "all cameras fused")
         axes.grid(axis="y", alpha=0.3)
+        axes.margins(y=0.2)
     panels[0].set_ylabel("RMSE of the centre, m")
     panels[0].legend(fontsize=8)

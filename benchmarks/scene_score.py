@@ -12,20 +12,12 @@ import numpy as np
 from benchmarks.average_precision import OVERLAPS, RECALLS, PrecisionRecall, precision_recall
 from benchmarks.centres import RANGE_M
 from benchmarks.position_errors import MATCH_M, PositionErrors, position_errors
-from benchmarks.scene_sets import (
-    DIFFICULTIES,
-    MIN_SHOWN,
-    UNGRADED,
-    SceneSets,
-    difficulty_of,
-    found,
-    frame_sets,
-    site_of_first,
-    wanted,
-)
+from benchmarks.scene_grades import UNGRADED, Grade, grade_of
+from benchmarks.scene_sets import MIN_SHOWN, SceneSets, found, frame_sets, site_of_first, wanted
 from benchmarks.scored_sets import Found, Wanted
 from benchmarks.tracking_scores import MIN_IOU, TrackingCounts, count_scene, moments, no_counts
 from models_export.data.dataset import Scene, SceneTruth
+from models_export.scenes.scenario import SCENARIOS
 from service.errors import InputError
 from service.frames import FrameSet
 from service.fusion import FusedBoxes
@@ -142,11 +134,12 @@ def score_scenes(
     """
     scores: Scores = {}
     for scene in sets.scenes:
-        group = scores.setdefault(difficulty_of(scene), {})
-        for name, view in _score_scene(sets, scene, make, settings, camera_counts).items():
+        grade = grade_of(scene)
+        group = scores.setdefault(grade.difficulty, {})
+        for name, view in _score_scene(sets, scene, grade, make, settings, camera_counts).items():
             group[name] = group.get(name, ViewScore()).joined(view)
         done()
-    ordered = {name: scores[name] for name in (*DIFFICULTIES, UNGRADED) if name in scores}
+    ordered = {name: scores[name] for name in (*SCENARIOS, UNGRADED) if name in scores}
     if len(ordered) > 1:
         everything: dict[str, ViewScore] = {}
         for group in ordered.values():
@@ -157,9 +150,19 @@ def score_scenes(
 
 
 def _score_scene(
-    sets: SceneSets, scene: Scene, make: PipelineFactory, settings: PipelineSettings, camera_counts: Sequence[int]
+    sets: SceneSets,
+    scene: Scene,
+    grade: Grade,
+    make: PipelineFactory,
+    settings: PipelineSettings,
+    camera_counts: Sequence[int],
 ) -> dict[str, ViewScore]:
     truths = [sets.truth(scene, step) for step in range(scene.steps)]
+    fits = [grade.fits(truth) for truth in truths]
+
+    def seen_by(site: Site) -> list[Wanted]:
+        return [wanted(truth, fit, scene.camera_ids, site) for truth, fit in zip(truths, fits, strict=True)]
+
     views: dict[str, ViewScore] = {}
     counts = [count for count in sorted(camera_counts) if count <= len(scene.site.cameras)]
     for count in counts:
@@ -167,9 +170,13 @@ def _score_scene(
         published = _run(scene, site, truths, make(settings))
         low = replace(settings, score_threshold=CURVE_SCORE, min_fused_score=CURVE_SCORE)
         candidates = _run(scene, site, truths, make(low))
-        views[str(count)] = _fused(scene, site, truths, published, candidates)
+        times = [truth.captured_at_ns for truth in truths]
+        views[str(count)] = _fused(site, times, seen_by(site), published, candidates)
         if count == counts[-1]:
-            views[SINGLE] = _single(scene, site, truths, published, candidates)
+            for camera in site.cameras:
+                alone = replace(site, cameras=(camera,))
+                view = _single(alone, seen_by(alone), published, candidates)
+                views[SINGLE] = views.get(SINGLE, ViewScore()).joined(view)
     return views
 
 
@@ -178,14 +185,13 @@ def _run(scene: Scene, site: Site, truths: list[SceneTruth], pipeline: SetPipeli
 
 
 def _fused(
-    scene: Scene, site: Site, truths: list[SceneTruth], published: list[SetResult], candidates: list[SetResult]
+    site: Site, times_ns: list[int], truth: list[Wanted], published: list[SetResult], candidates: list[SetResult]
 ) -> ViewScore:
-    truth = [wanted(t, scene.camera_ids, site) for t in truths]
     tracker = Tracker()
     tracked = []
-    for result, step in zip(published, truths, strict=True):
+    for result, captured_at_ns in zip(published, times_ns, strict=True):
         source = np.arange(len(result.boxes), dtype=np.int64)
-        out = tracker.update(FusedBoxes(result.boxes, result.members, source), step.captured_at_ns)
+        out = tracker.update(FusedBoxes(result.boxes, result.members, source), captured_at_ns)
         tracked.append(found(out.boxes, result.classes, site, out.track_id))
     return ViewScore(
         [found(r.boxes, r.classes, site) for r in published],
@@ -195,18 +201,14 @@ def _fused(
     )
 
 
-def _single(
-    scene: Scene, site: Site, truths: list[SceneTruth], published: list[SetResult], candidates: list[SetResult]
-) -> ViewScore:
-    """Each camera's own boxes against what that camera shows."""
-    view = ViewScore()
-    for camera in site.cameras:
-        alone = replace(site, cameras=(camera,))
-        for step, said, low in zip(truths, published, candidates, strict=True):
-            view.truth.append(wanted(step, scene.camera_ids, alone))
-            view.published.append(found(_own(said, camera.id), said.classes, alone))
-            view.candidates.append(found(_own(low, camera.id), low.classes, alone))
-    return view
+def _single(alone: Site, truth: list[Wanted], published: list[SetResult], candidates: list[SetResult]) -> ViewScore:
+    """The own boxes of the one camera of ``alone`` against what that camera shows."""
+    camera_id = alone.cameras[0].id
+    return ViewScore(
+        [found(_own(r, camera_id), r.classes, alone) for r in published],
+        [found(_own(r, camera_id), r.classes, alone) for r in candidates],
+        truth,
+    )
 
 
 def _own(result: SetResult, camera_id: str) -> Boxes:

@@ -2,13 +2,12 @@
 
 A vehicle counts for the cameras in use when it is a car and at least one of them, no farther than ``RANGE_M`` from its centre,
 shows more than ``MIN_SHOWN`` of its whole silhouette: the visible share of what lies inside the image, times the share that
-lies inside. All other vehicles, and vans, trucks and buses whatever they show, are ignored: found or not, they change
-nothing. People and cyclists are no vehicles: a box on one is false.
+lies inside; and when it is no harder than its scene (``scene_grades``). All other vehicles, and vans, trucks and buses
+whatever they show, are ignored: found or not, they change nothing. People and cyclists are no vehicles: a box on one is false.
 """
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -30,9 +29,6 @@ MIN_SHOWN = 0.3
 COUNTED = frozenset({"car"})
 IGNORED = frozenset({"van", "truck", "bus", "tram", "misc"})
 NO_VEHICLES = frozenset({"pedestrian", "person_sitting", "cyclist"})
-DIFFICULTIES = ("easy", "moderate", "hard")
-UNGRADED = "ungraded"
-"""Difficulty of a scene whose ``scene.json`` names none of ``DIFFICULTIES`` as its ``scenario``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +68,6 @@ def open_scene_sets(dataset: Path) -> SceneSets:
     return SceneSets(tuple(open_scene(path) for path in list_scenes(dataset)))
 
 
-def difficulty_of(scene: Scene) -> str:
-    """The difficulty of a scene, from the ``scenario`` in its ``scene.json``."""
-    scenario = json.loads((scene.path / "scene.json").read_text("utf-8")).get("scenario")
-    return str(scenario) if scenario in DIFFICULTIES else UNGRADED
-
-
 def site_of_first(scene: Scene, cameras: int) -> Site:
     """The scene's site cut to its first cameras."""
     return replace(scene.site, cameras=scene.site.cameras[:cameras])
@@ -90,8 +80,11 @@ def frame_sets(scene: Scene, site: Site, times_ns: Sequence[int]) -> Iterator[Fr
         yield FrameSet(site, frames, captured, step + 1)
 
 
-def wanted(truth: SceneTruth, all_cameras: Sequence[str], site: Site) -> Wanted:
-    """What the cameras of ``site`` have to find. all_cameras: ids of the columns of the truth's visibility."""
+def wanted(truth: SceneTruth, fits: NDArray[np.bool_], all_cameras: Sequence[str], site: Site) -> Wanted:
+    """What the cameras of ``site`` have to find.
+
+    fits: vehicles (N,) that are no harder than their scene. all_cameras: ids of the columns of the truth's visibility.
+    """
     columns = [list(all_cameras).index(camera.id) for camera in site.cameras]
     shown = (truth.visible * (1.0 - truth.truncated))[:, columns]
     positions = np.array([camera.position_m for camera in site.cameras]).reshape(-1, 3)
@@ -100,7 +93,7 @@ def wanted(truth: SceneTruth, all_cameras: Sequence[str], site: Site) -> Wanted:
     nearest = distance.min(1) if len(truth) else np.zeros(0)
     cars = np.array([name.lower() in COUNTED for name in truth.classes], dtype=bool)
     states = np.column_stack([truth.center, truth.dims_lwh, truth.yaw])
-    return Wanted(states, cars & np.isfinite(nearest), nearest, truth.ids)
+    return Wanted(states, cars & fits & np.isfinite(nearest), nearest, truth.ids)
 
 
 def found(boxes: Boxes, classes: Sequence[str], site: Site, track_id: Sequence[str] = ()) -> Found:

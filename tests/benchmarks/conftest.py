@@ -66,7 +66,8 @@ def dataset(tmp_path: Path, cameras: tuple[Camera, ...]) -> Path:
         folder = tmp_path / f"scene-{number}"
         save_site(Site(f"scene-{number}", cameras), folder / "site.json")
         (folder / "boxes").mkdir()
-        document = {"seed": number, "world": "straight", "rate_hz": 10.0, "steps": STEPS, "scenario": scenario}
+        document: dict[str, object] = {"seed": number, "world": "straight", "rate_hz": 10.0, "steps": STEPS}
+        document |= {"scenario": scenario, "condition": "day", "axes_rad": [0.3]}
         (folder / "scene.json").write_text(json.dumps(document))
         for step in range(STEPS):
             write_truth(folder / "boxes" / f"{step:06d}.json", step, moving_cars(number, step, cameras), ids)

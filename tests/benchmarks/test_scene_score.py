@@ -12,10 +12,11 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks import accuracy
+from benchmarks.scene_grades import grade_of
 from benchmarks.scene_plots import write_plots
 from benchmarks.scene_report import PAPER_AP, accuracy_table, paper_table
 from benchmarks.scene_score import ALL, SINGLE, Scores, score_scenes, settings_of, summaries
-from benchmarks.scene_sets import MIN_SHOWN, difficulty_of, in_view, open_scene_sets, wanted
+from benchmarks.scene_sets import MIN_SHOWN, in_view, open_scene_sets, wanted
 from service.errors import InputError, NotFoundError
 from service.geometry.camera import Camera
 from service.geometry.transforms import Array
@@ -25,6 +26,7 @@ from service.site import Site
 Factory = Callable[..., Any]
 Cameras = tuple[Camera, ...]
 STEPS = 8
+ALL_FIT = np.ones(1, dtype=bool)
 
 
 def score(dataset: Path, make: Any, counts: tuple[int, ...] = (1, 2, 3, 4)) -> Scores:
@@ -109,17 +111,17 @@ def test_no_answers_at_all(dataset: Path, answering: Factory) -> None:
     ],
 )
 def test_what_has_to_be_found(values: dict[str, Any], counted: bool, one_car: Factory, cameras: Cameras) -> None:
-    assert wanted(one_car(**values), "abcd", Site("s", cameras)).counted.tolist() == [counted]
+    assert wanted(one_car(**values), ALL_FIT, "abcd", Site("s", cameras)).counted.tolist() == [counted]
 
 
 def test_only_the_cameras_in_use_count(one_car: Factory, cameras: Cameras) -> None:
-    result = wanted(one_car(1.0, 0.0), "abcd", Site("s", cameras[1:]))
+    result = wanted(one_car(1.0, 0.0), ALL_FIT, "abcd", Site("s", cameras[1:]))
     assert not result.counted[0]
     assert result.distance_m[0] == np.inf
 
 
 def test_distance_is_to_the_nearest_camera_that_shows_it(one_car: Factory, cameras: Cameras) -> None:
-    result = wanted(one_car(1.0, 0.0, x=10.0), "abcd", Site("s", cameras))
+    result = wanted(one_car(1.0, 0.0, x=10.0), ALL_FIT, "abcd", Site("s", cameras))
     assert result.distance_m[0] == pytest.approx(np.linalg.norm([28.0, 18.0, 5.25]))
 
 
@@ -128,12 +130,33 @@ def test_a_place_behind_all_cameras_is_out_of_view(cameras: Cameras) -> None:
     np.testing.assert_array_equal(in_view(Site("s", cameras), places), [True, False, False])
 
 
-def test_difficulty_comes_from_the_scenes_scenario(dataset: Path) -> None:
+def test_difficulty_comes_from_the_scenes_scenario(dataset: Path, answering: Factory) -> None:
     sets = open_scene_sets(dataset)
-    assert [difficulty_of(scene) for scene in sets.scenes] == ["easy", "moderate", "hard"]
+    assert [grade_of(scene).difficulty for scene in sets.scenes] == ["easy", "moderate", "hard"]
+    edit_scene(dataset, scenario=None)
+    assert list(score(dataset, answering(), (1,))) == ["moderate", "hard", "ungraded", ALL]
+
+
+def test_an_unknown_scenario_names_the_file(dataset: Path) -> None:
+    path = edit_scene(dataset, scenario="sunny")
+    with pytest.raises(InputError, match="'sunny'") as caught:
+        grade_of(open_scene_sets(dataset).scenes[0])
+    assert caught.value.field == str(path)
+
+
+def test_vehicles_harder_than_their_scene_are_ignored(dataset: Path, answering: Factory) -> None:
+    # Against lanes that run another way every car is turned, which is more than an easy scene asks for.
+    edit_scene(dataset, axes_rad=[0.3 + np.pi / 4])
+    figures = summaries(score(dataset, answering(), (4,)))
+    assert figures["easy"]["4"]["vehicles"] == 0
+    assert figures["easy"]["4"]["ap_3d"]["0.7"] == {"R11": None, "R40": None}
+    assert figures["moderate"]["4"]["vehicles"] == 5 * STEPS
+
+
+def edit_scene(dataset: Path, **values: object) -> Path:
     path = dataset / "scene-0" / "scene.json"
-    path.write_text(path.read_text().replace('"easy"', '"sunny"'))
-    assert difficulty_of(sets.scenes[0]) == "ungraded"
+    path.write_text(json.dumps(json.loads(path.read_text()) | values))
+    return path
 
 
 def test_a_single_difficulty_has_no_total(dataset: Path, answering: Factory) -> None:
