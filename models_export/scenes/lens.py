@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
@@ -14,7 +15,7 @@ from models_export.scenes.renderer import Shot
 from service.geometry.camera import Camera
 
 _STEP_PX = 12
-"""The lens model is inverted on a grid this coarse; splines fill the rest, to better than a hundredth of a pixel."""
+"""The lens model and its inverse are taken on a grid this coarse; splines fill the rest to better than 0.01 px."""
 
 
 class Lens:
@@ -30,7 +31,7 @@ class Lens:
         self._inside: NDArray[np.bool_] | None = None
         if not camera.has_distortion:
             return
-        u, v = _pinhole_pixels(camera)
+        u, v = _sampled(camera, lambda xy: camera.normalised_from_pixels(xy) @ camera.K[:2, :2].T + camera.K[:2, 2])
         margin = 1.0
         low = np.floor([u.min() - margin, v.min() - margin])
         size = np.ceil([u.max() + margin, v.max() + margin]) - low + 1
@@ -38,7 +39,8 @@ class Lens:
         K[:2, 2] -= low
         self.source = replace(camera, width=int(size[0]), height=int(size[1]), K=K, distortion=np.zeros(0))
         self._maps = (u - low[0]).astype(np.float32), (v - low[1]).astype(np.float32)
-        self._inside = self._in_picture(np.stack(np.meshgrid(*(np.arange(n) for n in size)), -1))
+        seen_u, seen_v = _sampled(self.source, lambda xy: camera.pixels_from_normalised(self.source.normalised_from_pixels(xy)))
+        self._inside = (seen_u > -0.5) & (seen_u < camera.width - 0.5) & (seen_v > -0.5) & (seen_v < camera.height - 0.5)
 
     def bend(self, shot: Shot) -> Shot:
         """The shot of ``source`` as the camera's lens shows it."""
@@ -62,18 +64,12 @@ class Lens:
         nearest = np.clip(np.rint(pixels), 0, limits - 0.5).astype(np.int64)
         return np.asarray(on_canvas & self._inside[nearest[..., 1], nearest[..., 0]])
 
-    def _in_picture(self, pixels: NDArray[np.int64]) -> NDArray[np.bool_]:
-        seen = self.camera.pixels_from_normalised(self.source.normalised_from_pixels(pixels))
-        limits = np.array([self.camera.width - 0.5, self.camera.height - 0.5])
-        return np.asarray(np.all((seen > -0.5) & (seen < limits), axis=-1))
 
-
-def _pinhole_pixels(camera: Camera) -> tuple[Array, Array]:
-    """Where the pixels of a camera would be without its distortion: u and v, (H, W) each."""
+def _sampled(camera: Camera, mapping: Callable[[Array], Array]) -> tuple[Array, Array]:
+    """Where a smooth mapping (..., 2) -> (..., 2) takes each pixel of a camera: u and v, (H, W) each."""
     columns = np.linspace(0, camera.width - 1, camera.width // _STEP_PX + 2)
     rows = np.linspace(0, camera.height - 1, camera.height // _STEP_PX + 2)
-    grid = np.stack(np.meshgrid(columns, rows), -1)
-    straight = camera.normalised_from_pixels(grid) @ camera.K[:2, :2].T + camera.K[:2, 2]
+    values = mapping(np.stack(np.meshgrid(columns, rows), -1))
     fine = np.arange(camera.height), np.arange(camera.width)
-    u, v = (RectBivariateSpline(rows, columns, straight[..., k])(*fine) for k in range(2))
+    u, v = (RectBivariateSpline(rows, columns, values[..., k])(*fine) for k in range(2))
     return u, v
