@@ -189,13 +189,13 @@ def _fused(
 ) -> ViewScore:
     tracker = Tracker()
     tracked = []
-    for result, captured_at_ns in zip(published, times_ns, strict=True):
+    for result, captured_at_ns, vehicles in zip(published, times_ns, truth, strict=True):
         source = np.arange(len(result.boxes), dtype=np.int64)
         out = tracker.update(FusedBoxes(result.boxes, result.members, source), captured_at_ns)
-        tracked.append(found(out.boxes, result.classes, site, out.track_id))
+        tracked.append(found(out.boxes, result.classes, site, out.track_id).forgiven(vehicles))
     return ViewScore(
-        [found(r.boxes, r.classes, site) for r in published],
-        [found(r.boxes, r.classes, site) for r in candidates],
+        [found(r.boxes, r.classes, site).forgiven(w) for r, w in zip(published, truth, strict=True)],
+        [found(r.boxes, r.classes, site).forgiven(w) for r, w in zip(candidates, truth, strict=True)],
         truth,
         [count_scene(moments(tracked, truth))],
     )
@@ -205,8 +205,8 @@ def _single(alone: Site, truth: list[Wanted], published: list[SetResult], candid
     """The own boxes of the one camera of ``alone`` against what that camera shows."""
     camera_id = alone.cameras[0].id
     return ViewScore(
-        [found(_own(r, camera_id), r.classes, alone) for r in published],
-        [found(_own(r, camera_id), r.classes, alone) for r in candidates],
+        [found(_own(r, camera_id), r.classes, alone).forgiven(w) for r, w in zip(published, truth, strict=True)],
+        [found(_own(r, camera_id), r.classes, alone).forgiven(w) for r, w in zip(candidates, truth, strict=True)],
         truth,
     )
 

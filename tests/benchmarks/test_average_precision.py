@@ -66,6 +66,17 @@ def test_boxes_on_ignored_vehicles_or_out_of_view_are_left_out() -> None:
     np.testing.assert_array_equal(outcome(hidden, wanted([0.0]), iou_3d(f.states, cars([0.0])), 0.5), [1, -1])
 
 
+def test_boxes_that_stand_on_an_ignored_vehicle_are_forgiven() -> None:
+    truck = np.array([[0.0, 0.0, 1.6, 12.0, 2.5, 3.2, np.pi / 2]])
+    places = np.array([[0.0, 5.0], [0.0, 6.5], [2.0, 0.0]])
+    states = np.column_stack([places, np.tile([0.75, 4.0, 1.8, 1.5, 0.0], (3, 1))])
+    f = Found(states, np.ones(3), np.ones(3, dtype=bool))
+    ignored = Wanted(truck, np.zeros(1, dtype=bool), np.ones(1), np.zeros(1, np.int64))
+    np.testing.assert_array_equal(f.forgiven(ignored).in_view, [False, True, True])
+    assert f.forgiven(replace(ignored, counted=np.ones(1, dtype=bool))).in_view.all()
+    assert f.forgiven(wanted([])).in_view.all()
+
+
 def test_a_vehicle_that_counts_goes_before_a_nearer_ignored_one() -> None:
     f, w = found([0.4], [0.9]), wanted([0.0, 0.5], [True, False])
     np.testing.assert_array_equal(outcome(f, w, iou_3d(f.states, w.states), 0.5), [1])
