@@ -3,101 +3,42 @@
 from __future__ import annotations
 
 import json
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-import numpy as np
 import typer
 from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress
 from rich.table import Table
 
-from benchmarks.centres import MIN_CAMERAS, CentreScore, countable, near_cameras
-from benchmarks.clip_sets import clip_frame_sets, clip_truth
+from benchmarks.clip_score import score_clip, score_roadside
+from benchmarks.kitti_folders import read_ids, read_pair
+from benchmarks.kitti_protocol import CLASSES, DEFAULT_OVERLAPS, as_percent, evaluate
+from benchmarks.kitti_report import kitti_notes, kitti_table
 from benchmarks.machine import describe_machine
-from benchmarks.recordings import ROADSIDE_STEPS, RoadsideClip, open_roadside_clip
-from clients.clip import SHIPPED, ClipError, open_clip
-from service.errors import QuadliftError
-from service.frames import EncodedFrame, FrameSet, decode
-from service.geometry.iou import iou_2d
-from service.geometry.transforms import Array
+from benchmarks.recordings import open_roadside_clip
+from benchmarks.scene_plots import write_plots
+from benchmarks.scene_report import accuracy_table, distance_table, paper_table, tracking_table
+from benchmarks.scene_score import RULES, score_scenes, settings_of, summaries
+from benchmarks.scene_sets import SceneSets, open_scene_sets
+from clients.clip import SHIPPED, ClipError
+from service.errors import InputError, QuadliftError
 from service.nets.pack import load_pack
 from service.pipeline import Pipeline, PipelineSettings
-from service.site import Site
 
 app = typer.Typer(help="How many vehicles are found, and how exactly.", no_args_is_help=True)
-console = Console()
+PIPED_WIDTH = 150
+console = Console(width=None if sys.stdout.isatty() else PIPED_WIDTH)
+notes = Console(stderr=True, soft_wrap=True)
+"""What is said beside the result, so that standard output stays JSON with --json."""
 
 PackOption = Annotated[str, typer.Option(help="Pack: a shipped one's name, or a folder.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-
-ROADSIDE_IOU = 0.4
-ROADSIDE_RANGE_M = 40.0
-ROADSIDE_MATCH_M = 1.5
-
-
-def score_clip(pipeline: Pipeline, clip_path: Path = SHIPPED, cameras: int | None = None) -> dict[str, float | int]:
-    """Fused boxes of every step of a clip against its truth.
-
-    Counted are vehicles that two cameras see more than half of from within 40 m; a box is false when it lies within 40 m of
-    two cameras and no vehicle's centre is within 1 m of its own.
-    """
-    clip = open_clip(clip_path)
-    score = CentreScore()
-    for frame_set, truth in zip(clip_frame_sets(clip, cameras), clip_truth(clip), strict=True):
-        site = frame_set.site
-        boxes = pipeline.run(frame_set).boxes
-        counted = near_cameras(site, boxes.center) >= min(MIN_CAMERAS, len(site.cameras))
-        visible = truth.visible[:, : len(site.cameras)]
-        score.add(boxes.center, counted, truth.center, countable(site, truth.center, visible))
-    return score.summary()
-
-
-def score_roadside(pipeline: Pipeline, clip: RoadsideClip) -> dict[str, Any]:
-    """The roadside clip by its protocol: 2D recall at IoU > 0.4, and fused centres within 1.5 m."""
-    references = recalled = false = 0
-    fused = CentreScore(ROADSIDE_MATCH_M)
-    for step in ROADSIDE_STEPS:
-        frames = {camera.id: clip.frame(camera.id, step) for camera in clip.site.cameras}
-        for camera in clip.site.cameras:
-            image = decode(frames[camera.id], camera, pipeline.detector.spec.max_width)
-            found = pipeline.detector.detect([image], score_threshold=pipeline.settings.score_threshold)[0]
-            scale = np.array([camera.width / image.shape[1], camera.height / image.shape[0]] * 2)
-            hits = _greedy_hits(found.xyxy_px * scale, clip.reference_2d(camera.id, step))
-            references += len(clip.reference_2d(camera.id, step))
-            recalled += hits
-            false += len(found) - hits
-        encoded = tuple(EncodedFrame(camera_id, data, step) for camera_id, data in frames.items())
-        boxes = pipeline.run(FrameSet(clip.site, encoded, step * 100_000_000, step + 1)).boxes
-        center = clip.reference(step)[0]
-        fused.add(boxes.center, np.ones(len(boxes), dtype=bool), center, _seen_by_two(clip, step, center))
-    return {
-        "2d": {"references": references, "recalled": recalled, "false": false},
-        "3d_seen_by_two_within_40_m": fused.summary(),
-    }
-
-
-def _seen_by_two(clip: RoadsideClip, step: int, center: Array) -> Any:
-    """Vehicles (N,) whose centre projects into two cameras' images, from within 40 m."""
-    views = [_in_view(clip.site, index, center) for index in range(len(clip.site.cameras))]
-    return np.sum(views, axis=0) >= MIN_CAMERAS
-
-
-def _in_view(site: Site, index: int, center: Array) -> Any:
-    camera = site.cameras[index]
-    pixels, depth = camera.project(center)
-    inside = np.all((pixels >= 0) & (pixels <= [camera.width - 1, camera.height - 1]), axis=1)
-    return inside & (depth > 0) & (np.linalg.norm(center - camera.position_m, axis=1) <= ROADSIDE_RANGE_M)
-
-
-def _greedy_hits(ours: Array, reference: Array) -> int:
-    """How many of our boxes (best first) take a reference box each at IoU > 0.4."""
-    overlap = iou_2d(ours, reference)
-    hits = 0
-    for row in range(len(ours)):
-        if overlap.shape[1] and (best := int(overlap[row].argmax())) >= 0 and overlap[row, best] > ROADSIDE_IOU:
-            overlap[:, best] = 0.0
-            hits += 1
-    return hits
 
 
 @app.command("clip")
@@ -117,12 +58,86 @@ def roadside_command(pack: PackOption = "edge", as_json: JsonOption = False) -> 
     _report("roadside", pack, lambda pipeline: score_roadside(pipeline, open_roadside_clip()), as_json)
 
 
-def _report(name: str, pack: str, score: Any, as_json: bool) -> None:
+@app.command("kitti")
+def kitti_command(
+    labels: Annotated[Path, typer.Option(help="Folder of KITTI label files (label_2).")],
+    results: Annotated[Path, typer.Option(help="Folder of result files in KITTI's format, with scores.")],
+    ids: Annotated[Path, typer.Option(help="Text file of frame ids, one a line.")],
+    min_overlap: Annotated[float, typer.Option(min=0, max=1, help="Least overlap of a car.")] = DEFAULT_OVERLAPS["Car"],
+    min_overlap_others: Annotated[
+        float, typer.Option(min=0, max=1, help="Least overlap of a pedestrian or cyclist.")
+    ] = DEFAULT_OVERLAPS["Pedestrian"],
+    as_json: JsonOption = False,
+) -> None:
+    """Average precision by KITTI's own protocol: 2D, orientation, bird's-eye view and 3D, at 11 and 40 recalls."""
+    started = time.perf_counter()
+    with _errors_named():
+        pair = read_pair(labels, results, read_ids(ids))
+    overlaps = {name: min_overlap if name == "Car" else min_overlap_others for name in CLASSES}
+    curves = evaluate(pair, overlaps)
+    if as_json:
+        typer.echo(json.dumps(as_percent(curves), indent=1))
+    else:
+        console.print(kitti_table(curves, overlaps))
+    for note in kitti_notes(pair, curves):
+        notes.print(f"[yellow]{note}[/yellow]")
+    notes.print(f"{pair.frames} frames in {time.perf_counter() - started:.1f} s")
+
+
+@app.command("scenes")
+def scenes_command(
+    dataset: Annotated[Path, typer.Argument(help="Folder of scenes, or one scene's folder.")],
+    pack: PackOption = "edge",
+    cameras: Annotated[int | None, typer.Option(min=1, help="Use only the first N; each count if left out.")] = None,
+    method: Annotated[Literal["map", "paper"], typer.Option(help="How boxes are lifted and fused.")] = "map",
+    as_json: JsonOption = False,
+    plots: Annotated[Path | None, typer.Option(help="Folder for precision-recall curves and RMSE bars as PNG.")] = None,
+) -> None:
+    """Fused and single-camera boxes on scenes with exact truth: AP, position errors, tracking, by difficulty."""
+    with _errors_named():
+        settings = settings_of(method)
+        sets = open_scene_sets(dataset)
+        counts = _camera_counts(sets, cameras)
+        loaded = load_pack(pack)
+        with Progress(console=notes, transient=True) as progress:
+            task = progress.add_task("scenes", total=len(sets.scenes))
+            scores = score_scenes(sets, lambda s: Pipeline(loaded, s), settings, counts, lambda: progress.advance(task))
+        figures = summaries(scores)
+        for path in write_plots(scores, plots) if plots else []:
+            notes.print(f"wrote {path}")
+    for name, count in sorted(sets.unknown.items()):
+        notes.print(f"[yellow]{count} objects of the unknown class '{escape(name)}' skipped.[/yellow]")
+    if as_json:
+        about = {"dataset": str(dataset), "scenes": len(sets.scenes), "pack": pack, "method": method, "rules": RULES}
+        typer.echo(json.dumps({**about, "machine": describe_machine(), "difficulties": figures}, indent=1))
+        return
+    console.print(accuracy_table(figures, f"{dataset.name}: {len(sets.scenes)} scenes, pack {pack}, method {method}"))
+    for table in (distance_table(figures), tracking_table(figures), paper_table(figures)):
+        console.print(table)
+
+
+def _camera_counts(sets: SceneSets, cameras: int | None) -> list[int]:
+    """Camera counts to score. Raises InputError when no scene has as many as are asked for."""
+    if cameras is None:
+        return list(range(1, sets.most_cameras + 1))
+    if cameras > sets.most_cameras:
+        raise InputError(f"no scene has {cameras} cameras.", field="--cameras", remedy=f"The most is {sets.most_cameras}.")
+    return [cameras]
+
+
+@contextmanager
+def _errors_named() -> Iterator[None]:
+    """Turn the errors that a user can mend into one line and exit code 2."""
     try:
-        result = score(Pipeline(load_pack(pack), PipelineSettings()))
+        yield
     except (QuadliftError, ClipError) as error:
-        console.print(f"[red]{error}[/red]")
+        notes.print(f"[red]{escape(str(error))}[/red]")
         raise typer.Exit(2) from None
+
+
+def _report(name: str, pack: str, score: Any, as_json: bool) -> None:
+    with _errors_named():
+        result = score(Pipeline(load_pack(pack), PipelineSettings()))
     if as_json:
         typer.echo(json.dumps({name: result, "pack": pack, "machine": describe_machine()}, indent=1))
         return

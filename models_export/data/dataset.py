@@ -50,6 +50,8 @@ class SceneTruth:
     """(N, C) visible pixels over the pixels inside the image that the vehicle would have alone; 0 where not seen."""
     truncated: Array
     """(N, C) part of the silhouette outside the image, 0..1; 1 where not seen."""
+    kinds: tuple[str, ...] = ()
+    """N kinds, finer than classes: car, van, truck, bus, pedestrian, cyclist; empty where they are not known."""
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -69,6 +71,7 @@ def write_truth(path: Path, step: int, truth: SceneTruth, camera_ids: tuple[str,
             {
                 "id": int(truth.ids[k]),
                 "class": truth.classes[k],
+                **({"kind": truth.kinds[k]} if truth.kinds else {}),
                 "center": _rounded(truth.center[k]),
                 "dims_lwh": _rounded(truth.dims_lwh[k]),
                 "yaw": round(float(truth.yaw[k]), 6),
@@ -173,6 +176,7 @@ def parse_truth(document: Any, camera_ids: tuple[str, ...]) -> SceneTruth:
         np.array([b["velocity"] for b in boxes], dtype=np.float64).reshape(n, 3),
         visible.reshape(n, len(camera_ids)),
         truncated.reshape(n, len(camera_ids)),
+        tuple(str(b.get("kind", b["class"].lower())) for b in boxes),
     )
 
 

@@ -1,108 +1,135 @@
-"""``quadlift scenes``: render datasets and previews with the simulator."""
+"""``quadlift scenes``: render datasets, the evaluation set and previews with the simulator."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-import cv2
-import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from models_export.scenes.generate import SceneMaker, SceneRequest, new_renderer, render_scene
+from models_export.scenes.cameras import RIGS
+from models_export.scenes.light import WEATHERS
+from models_export.scenes.preview import contact_sheet, write_picture
+from models_export.scenes.renderer import Renderer
+from models_export.scenes.request import SceneRequest, parse_size, world_of
 from models_export.scenes.roads import WORLDS
+from models_export.scenes.scenario import SCENARIOS
+from models_export.scenes.writer import render_scene
 from service.errors import QuadliftError
 
-app = typer.Typer(no_args_is_help=True, help="Render simulated scenes: training data, clips, previews.")
+app = typer.Typer(no_args_is_help=True, help="Render simulated scenes: training data, clips, the evaluation set, previews.")
 console = Console(stderr=True)
 
+World = StrEnum("World", {name: name for name in (*WORLDS, "mix")})  # type: ignore[misc]
+"""Worlds on the command line; ``mix`` takes them in turn."""
+Weather = StrEnum("Weather", {name: name for name in WEATHERS})  # type: ignore[misc]
+Scenario = StrEnum("Scenario", {name: name for name in SCENARIOS})  # type: ignore[misc]
+Rig = StrEnum("Rig", {name: name for name in (*RIGS, "mix")})  # type: ignore[misc]
 
-class World(StrEnum):
-    """Worlds on the command line; ``mix`` takes them in turn."""
-
-    INTERSECTION = "intersection"
-    STRAIGHT = "straight"
-    MIX = "mix"
-
-
-class Condition(StrEnum):
-    """``light.CONDITIONS`` on the command line."""
-
-    DAY = "day"
-    OVERCAST = "overcast"
-    DUSK = "dusk"
-
-
-def world_of(world: World, index: int) -> str:
-    """The world of the scene number ``index``; a mix has two intersections for each straight road."""
-    return str(world.value) if world is not World.MIX else WORLDS[int(index % 3 == 2)]
+WorldOption = Annotated[World, typer.Option(help="Which world.")]
+WeatherOption = Annotated[Weather | None, typer.Option(help="Light and weather; drawn if not given.")]
+ScenarioOption = Annotated[Scenario | None, typer.Option(help="How hard; everything is drawn if not given.")]
+RigOption = Annotated[Rig, typer.Option(help="Camera layout.")]
 
 
 @app.command()
 def render(
     out: Annotated[Path, typer.Option(help="Folder for the scene folders.")],
-    world: Annotated[World, typer.Option(help="Which world.")] = World.MIX,
+    world: WorldOption = World.mix,
+    scenario: ScenarioOption = None,
+    rig: RigOption = Rig.poles,
+    weather: WeatherOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first scene; the next ones count up.")] = 0,
     scenes: Annotated[int, typer.Option(min=1, help="Number of scenes.")] = 1,
     steps: Annotated[int, typer.Option(min=1, help="Frame sets a scene.")] = 10,
     rate_hz: Annotated[float, typer.Option(min=0.01, max=100, help="Frame sets a second of simulated time.")] = 10.0,
     cameras: Annotated[int, typer.Option(min=1, max=8, help="Cameras a scene.")] = 4,
-    quality: Annotated[int | None, typer.Option(min=1, max=100, help="JPEG quality; drawn from 75..95 if not given.")] = None,
-    vehicles: Annotated[
-        int | None, typer.Option(min=0, max=60, help="Vehicles a scene; drawn from 4..25 if not given.")
-    ] = None,
-    condition: Annotated[Condition | None, typer.Option(help="Light; drawn if not given.")] = None,
+    size: Annotated[str, typer.Option(help="Picture size such as 1284x384, or mix.")] = "1284x384",
+    distorted: Annotated[bool, typer.Option("--distorted", help="Lenses distort.")] = False,
+    quality: Annotated[int | None, typer.Option(min=1, max=100, help="JPEG quality; drawn from 30..95 if not given.")] = None,
+    vehicles: Annotated[int | None, typer.Option(min=0, max=60, help="Vehicles a scene; drawn if not given.")] = None,
 ) -> None:
     """Render scenes to disk: JPEG, depth, KITTI labels and calibration, site and world boxes."""
-    requests = [
-        SceneRequest(seed + k, world_of(world, k), steps, rate_hz, cameras, quality, condition, vehicles) for k in range(scenes)
-    ]
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     try:
-        renderer = new_renderer()
-        started = time.perf_counter()
-        with Progress(*columns, console=console) as progress, ThreadPoolExecutor(2) as pool:
-            task = progress.add_task("images", total=scenes * steps * cameras)
-            for request in requests:
-                folder = out / f"{request.world}-{request.seed:05d}"
-                for step in render_scene(request, folder, renderer, pool):
-                    progress.advance(task, len(step.shots))
+        requests = [
+            SceneRequest(
+                seed + k,
+                world_of(world.value, k, weather, scenario, rig.value),
+                steps,
+                rate_hz,
+                cameras,
+                quality,
+                weather and weather.value,
+                vehicles,
+                scenario and scenario.value,
+                RIGS[k % len(RIGS)] if rig is Rig.mix else rig.value,
+                parse_size(size),
+                distorted,
+            )
+            for k in range(scenes)
+        ]
+        for request in requests:
+            request.check(reserved=False)
+        render_all(requests, [out / f"{r.world}-{r.seed:05d}" for r in requests])
     except QuadliftError as error:
         console.print(f"[red]{error}")
         raise typer.Exit(1) from error
+
+
+def render_all(requests: Sequence[SceneRequest], folders: Sequence[Path]) -> None:
+    """Render scenes into folders with a progress bar, then print the speed. Raises QuadliftError."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    images = sum(r.steps * r.cameras for r in requests)
+    renderer = Renderer()
+    started = time.perf_counter()
+    with Progress(*columns, console=console) as progress, ThreadPoolExecutor(2) as pool:
+        task = progress.add_task("images", total=images)
+        for request, folder in zip(requests, folders, strict=True):
+            for step in render_scene(request, folder, renderer, pool):
+                progress.advance(task, len(step.shots))
     seconds = time.perf_counter() - started
-    images = scenes * steps * cameras
     console.print(f"{images} images in {seconds:.1f} s: {images / seconds:.1f} images/s, scene set-up and files included")
 
 
 @app.command()
 def preview(
-    out: Annotated[Path, typer.Option(help="PNG to write.")],
+    out: Annotated[Path, typer.Option(help="PNG or JPG to write.")],
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first scene.")] = 0,
     scenes: Annotated[int, typer.Option(min=1, max=16, help="Rows of the sheet.")] = 4,
-    world: Annotated[World, typer.Option(help="Which world.")] = World.MIX,
+    world: WorldOption = World.mix,
+    weather: WeatherOption = None,
+    scenario: ScenarioOption = None,
+    rig: RigOption = Rig.poles,
+    cameras: Annotated[int, typer.Option(min=1, max=8, help="Columns of the sheet.")] = 4,
+    scale: Annotated[float, typer.Option(min=0.1, max=1, help="Size of each picture.")] = 0.5,
+    distorted: Annotated[bool, typer.Option("--distorted", help="Lenses distort.")] = False,
+    boxes: Annotated[bool, typer.Option("--boxes", help="Draw the labelled boxes.")] = False,
 ) -> None:
-    """Write a contact sheet: one row a scene, one column a camera."""
+    """Write a contact sheet: one row a scene, one column a camera, as the cameras would deliver them."""
     try:
-        renderer = new_renderer()
+        requests = [
+            SceneRequest(
+                seed + k,
+                world_of(world.value, k, weather, scenario, rig.value),
+                steps=1,
+                cameras=cameras,
+                weather=weather and weather.value,
+                scenario=scenario and scenario.value,
+                rig=RIGS[k % len(RIGS)] if rig is Rig.mix else rig.value,
+                distorted=distorted,
+            )
+            for k in range(scenes)
+        ]
+        write_picture(out, contact_sheet(requests, Renderer(), scale, boxes=boxes))
     except QuadliftError as error:
         console.print(f"[red]{error}")
         raise typer.Exit(1) from error
-    rows = []
-    for k in range(scenes):
-        maker = SceneMaker(SceneRequest(seed + k, world_of(world, k), steps=1), renderer)
-        step = next(maker.steps())
-        rows.append(
-            np.hstack([cv2.resize(shot.image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for shot in step.shots])
-        )
-    encoded, png = cv2.imencode(".png", cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))
-    assert encoded
-    out.write_bytes(png.tobytes())
     console.print(f"wrote {out}")
 
 

@@ -1,4 +1,4 @@
-"""The four-way intersection: two roads of one or two lanes a side, rounded corners, stop lines, crosswalks, lights."""
+"""Crossings with lights: the four-way intersection, and the T-junction, where one arm is missing."""
 
 from __future__ import annotations
 
@@ -6,9 +6,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models_export.scenes.layout import REACH_M, Bay, Plot, RoadWorld, Route, plot, resampled, rounded, turned
+from models_export.scenes.layout import REACH_M, Bay, Plot, RoadWorld, Route, offset, plot, resampled, rounded, turned
 from models_export.scenes.mesh import Array, MeshBuilder, Surface
-from models_export.scenes.pavement import WHITE, Style, arrow, dashes, lay_asphalt, lay_block, lay_wear, paint, sample_style
+from models_export.scenes.pavement import (
+    KERB_M,
+    WHITE,
+    Style,
+    arrow,
+    crosswalk,
+    dashes,
+    lay_asphalt,
+    lay_block,
+    lay_wear,
+    paint,
+    sample_style,
+)
 
 _QUARTERS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
 """Signs of x and y of the four corners."""
@@ -16,8 +28,10 @@ _QUARTERS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
 
 @dataclass(frozen=True)
 class _Plan:
-    """Measures of one intersection; pairs are for the road along x, then the road along y."""
+    """Measures of one crossing; pairs are for the road along x, then the road along y."""
 
+    arms: tuple[int, ...]
+    """0 comes in from the east, 1 from the north, 2 from the west, 3 from the south."""
     style: Style
     lanes: tuple[int, int]
     """Lanes each way."""
@@ -41,8 +55,18 @@ class _Plan:
 
 
 def intersection(rng: np.random.Generator) -> RoadWorld:
-    """A random intersection, centred on the origin."""
+    """A random four-way intersection, centred on the origin."""
+    return _crossing("intersection", (0, 1, 2, 3), rng)
+
+
+def t_junction(rng: np.random.Generator) -> RoadWorld:
+    """A random T-junction: a road along x, and one that joins it from the north."""
+    return _crossing("t-junction", (0, 1, 2), rng)
+
+
+def _crossing(kind: str, arms: tuple[int, ...], rng: np.random.Generator) -> RoadWorld:
     plan = _Plan(
+        arms,
         sample_style(rng),
         (int(rng.integers(1, 3)), int(rng.integers(1, 3))),
         (bool(rng.random() < 0.6), bool(rng.random() < 0.6)),
@@ -50,16 +74,35 @@ def intersection(rng: np.random.Generator) -> RoadWorld:
         bool(rng.random() < 0.8),
     )
     ground = MeshBuilder()
+    far, kerbs = REACH_M + 20, []
     for sx, sy in _QUARTERS:
-        lay_block(ground, _corner_outline(plan, sx, sy), np.array([sx, sy]) * (REACH_M + 20), plan.style)
+        if sy > 0 or 3 in arms:
+            kerbs.append(_corner_outline(plan, sx, sy))
+            lay_block(ground, kerbs[-1], np.array([sx, sy]) * far, plan.style)
+    if 3 not in arms:
+        kerbs.append(np.array([[far, -plan.half(0)], [-far, -plan.half(0)]]))
+        lay_block(ground, kerbs[-1], np.array([[far, -far], [-far, -far]]), plan.style)
     lay_asphalt(ground, plan.style)
-    lay_wear(ground, plan.style, (plan.half(0), plan.half(1)), rng)
+    lay_wear(ground, plan.style, (plan.half(0), plan.half(1)) if 3 in arms else (plan.half(0), 0.0), rng)
     routes: list[Route] = []
-    for arm in range(4):
+    for arm in arms:
         _markings(ground, plan, arm, rng)
         routes += _routes(plan, arm, float(rng.uniform(9.0, 14.0)))
-    bays = [bay for arm in range(4) if plan.parking[arm % 2] for bay in _bays(plan, arm)]
-    return RoadWorld("intersection", ground, tuple(routes), tuple(bays), _plots(plan, rng), _poles(plan, rng), 4)
+    bays = [bay for arm in arms if plan.parking[arm % 2] for bay in _bays(plan, arm)]
+    walks = tuple(offset(line, plan.style.walk_m * share) for line in kerbs for share in (0.35, 0.7))
+    return RoadWorld(
+        kind,
+        ground,
+        tuple(routes),
+        tuple(bays),
+        _plots(plan, rng),
+        _poles(plan, rng),
+        len(arms),
+        (0.0, np.pi / 2),
+        walks,
+        KERB_M,
+        tuple(kerbs),
+    )
 
 
 def _corner_outline(plan: _Plan, sx: int, sy: int) -> Array:
@@ -91,8 +134,7 @@ def _markings(ground: MeshBuilder, plan: _Plan, arm: int, rng: np.random.Generat
     paint(ground, R, (stop, stop + 0.45), (0.2, lanes * lane))
     if plan.crosswalks:
         near, width = plan.half(1 - arm % 2) + plan.corner_m + 0.6, plan.half(arm % 2)
-        for y in np.arange(-width + 0.5, width - 0.5, 1.0):
-            paint(ground, R, (near, near + 3.2), (y, y + 0.5))
+        crosswalk(ground, R, near, width)
 
 
 def _centre_line(ground: MeshBuilder, R: Array, stop: float, rng: np.random.Generator) -> None:
@@ -112,20 +154,23 @@ def _routes(plan: _Plan, arm: int, speed_mps: float) -> list[Route]:
     own, cross = plan.lanes[arm % 2], plan.lanes[1 - arm % 2]
     routes = []
 
-    def add(way: Array, turn_mps: float, curve: tuple[float, float]) -> None:
-        routes.append(Route(resampled(way) @ R.T, arm, REACH_M - plan.stop(arm) - 0.7, speed_mps, turn_mps, curve))
+    def add(way: Array, turn_mps: float, curve: tuple[float, float], longest_m: float = np.inf) -> None:
+        stop, group = REACH_M - plan.stop(arm) - 0.7, plan.arms.index(arm)
+        routes.append(Route(resampled(way) @ R.T, group, stop, speed_mps, turn_mps, curve, longest_m))
 
+    ahead, right, left = ((arm + k) % 4 in plan.arms for k in (2, 1, 3))
     for k in range(own):
         y = (k + 0.5) * lane
-        add(np.array([[REACH_M, y], [-REACH_M, y]]), speed_mps, (0.0, 0.0))
-        if k == own - 1:
+        if ahead:
+            add(np.array([[REACH_M, y], [-REACH_M, y]]), speed_mps, (0.0, 0.0))
+        if right and k == own - 1:
             x = (cross - 0.5) * lane
             way = rounded(np.array([[REACH_M, y], [x, y], [x, REACH_M]]), plan.corner_m + 0.5 * lane)
-            add(way, 5.5, (REACH_M - x - 9, REACH_M - x + 9))
-        if k == 0:
+            add(way, 5.5, (REACH_M - x - 9, REACH_M - x + 9), 7.0)
+        if left and k == 0:
             x = -0.5 * lane
             way = rounded(np.array([[REACH_M, y], [x, y], [x, -REACH_M]]), (0.5 + cross) * lane + 2.0)
-            add(way, 7.5, (REACH_M - x - 14, REACH_M - x + 6))
+            add(way, 7.5, (REACH_M - x - 14, REACH_M - x + 6), 8.5)
     return routes
 
 
@@ -147,10 +192,13 @@ def _plots(plan: _Plan, rng: np.random.Generator) -> tuple[Plot, ...]:
     hx, hy = plan.half(1) + back, plan.half(0) + back
     plots = []
     for sx, sy in _QUARTERS:
+        closed = sy < 0 and 3 not in plan.arms
         for start in np.arange(0.0, 80.0, 20.0):
             plots.append(plot(sx, sy, (hx + 5 + start, hy), (hx + 23 + start, hy + 16)))
-            if start > 0:
+            if start > 0 and not closed:
                 plots.append(plot(sx, sy, (hx, hy + 5 + start), (hx + 16, hy + 23 + start)))
+    if 3 not in plan.arms:
+        plots.append(plot(1, -1, (-hx, hy), (hx, hy + 16)))
     return tuple(plots)
 
 

@@ -34,6 +34,13 @@ class Route:
     """Speed within its curve."""
     curve_m: tuple[float, float]
     """Where the curve starts and ends along the route; an empty range for none."""
+    longest_m: float = np.inf
+    """Vehicles longer than this keep out: they would cut its curve."""
+
+    @property
+    def turns(self) -> bool:
+        """Whether it has a curve."""
+        return self.curve_m[1] > self.curve_m[0]
 
     @property
     def length_m(self) -> float:
@@ -71,6 +78,25 @@ class RoadWorld:
     """Camera poles: foot (2,) and the point on the ground (2,) that the camera looks towards."""
     phases: int
     """Number of traffic light groups; 0 without lights."""
+    axes_rad: tuple[float, ...]
+    """Directions of its lanes, each standing for both ways along it: what a vehicle's rotation is measured from."""
+    walks: tuple[Array, ...]
+    """Polylines (N, 2) that people walk along."""
+    walk_z_m: float
+    """Height of the walks."""
+    kerbs: tuple[Array, ...] = ()
+    """Polylines (N, 2) with the sidewalk on their left; street lamps stand along them."""
+    ceiling_lamps: Array | None = None
+    """(N, 3) lamps of an indoor world; None outdoors."""
+
+    @property
+    def indoor(self) -> bool:
+        """Whether there is a roof over it."""
+        return self.ceiling_lamps is not None
+
+    def clear_of_routes(self, spot: Array) -> float:
+        """Metres (in the larger of x and y) from a spot (2,) to the nearest point of any route."""
+        return min(float(np.abs(route.points - spot).max(1).min()) for route in self.routes)
 
 
 def turned(arm: int) -> Array:
@@ -102,3 +128,17 @@ def plot(sx: int, sy: int, low: tuple[float, float], high: tuple[float, float]) 
     corners = np.array([low, high]) * np.array([sx, sy])
     (x0, y0), (x1, y1) = corners.min(0).tolist(), corners.max(0).tolist()
     return Plot((x0, y0), (x1, y1))
+
+
+def offset(line: Array, distance: float) -> Array:
+    """A polyline (N, 2) shifted to its left."""
+    step = np.empty_like(line)
+    segments = np.diff(line, axis=0)
+    segments /= np.linalg.norm(segments, axis=1, keepdims=True)
+    step[0], step[-1] = segments[0], segments[-1]
+    step[1:-1] = segments[:-1] + segments[1:]
+    step /= np.linalg.norm(step, axis=1, keepdims=True)
+    normal = np.stack([-step[:, 1], step[:, 0]], 1)
+    cosine = np.ones(len(line))
+    cosine[1:-1] = np.einsum("ij,ij->i", step[1:-1], segments[:-1])
+    return line + normal * (distance / cosine)[:, None]

@@ -14,6 +14,8 @@ VERTEX_FORMAT = "3f4 3f4 4f1 4f1"
 VERTEX_ATTRIBUTES = ("in_position", "in_normal", "in_color", "in_surface")
 _VERTEX_DTYPE = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("color", "u1", 4), ("surface", "u1", 4)])
 _WELD_M = 1e-4
+_HASH = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0x27D4EB2F165667C5], dtype=np.uint64)
+"""Odd multipliers, one for each eight bytes of a vertex: equal sums mean equal vertices, but for one chance in 2^64 a pair."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +77,10 @@ class Mesh:
         vertices["normal"] = self.normals.reshape(-1, 3)
         looks = np.repeat(self.looks, 3, axis=0)
         vertices["color"], vertices["surface"] = looks[:, :4], looks[:, 4:]
-        unique, index = np.unique(vertices.view(f"V{_VERTEX_DTYPE.itemsize}"), return_inverse=True)
-        return unique.tobytes(), index.astype("<u4").tobytes()
+        # Sorting one number a vertex is several times faster than sorting the vertices' bytes.
+        words = vertices.view(np.uint64).reshape(len(vertices), -1)
+        _, first, index = np.unique((words * _HASH).sum(1), return_index=True, return_inverse=True)
+        return vertices[first].tobytes(), index.astype("<u4").tobytes()
 
 
 def joined(meshes: Sequence[Mesh]) -> Mesh:
@@ -147,17 +151,16 @@ class MeshBuilder:
 
 def crease_normals(triangles: Array, faces: Array, area: Array, crease_rad: float) -> Array:
     """Vertex normals (F, 3, 3): area-weighted means over the faces at a vertex that bend less than the crease angle."""
-    keys = np.round(triangles.reshape(-1, 3) / _WELD_M).astype(np.int64)
-    _, vertex = np.unique(keys, axis=0, return_inverse=True)
-    vertex = vertex.reshape(-1)
-    order = np.argsort(vertex, kind="stable")
-    counts = np.bincount(vertex)
-    starts = np.cumsum(counts) - counts
+    cells = np.round(triangles.reshape(-1, 3) / _WELD_M).astype(np.int64).astype(np.uint64)
+    keys = (cells * _HASH[:3]).sum(1)
+    order = np.argsort(keys, kind="stable")
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(keys[order]) != 0]))
+    counts = np.diff(np.append(starts, len(keys)))
     # All pairs (corner, other corner at the same vertex), by repeating each corner once per member of its group.
-    size = counts[vertex[order]]
+    size = np.repeat(counts, counts)
     left = np.repeat(order, size)
     step = np.arange(len(left)) - np.repeat(np.cumsum(size) - size, size)
-    right = order[np.repeat(starts[vertex[order]], size) + step]
+    right = order[np.repeat(np.repeat(starts, counts), size) + step]
     near = np.einsum("ij,ij->i", faces[left // 3], faces[right // 3]) > np.cos(crease_rad)
     left, right = left[near], right[near]
     weighted = faces[right // 3] * area[right // 3, None]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models_export.scenes.layout import REACH_M, turned
+from models_export.scenes.layout import REACH_M, offset, turned
 from models_export.scenes.mesh import Array, MeshBuilder, Surface
 
 KERB_M = 0.13
@@ -31,8 +31,11 @@ class Style:
 
 def sample_style(rng: np.random.Generator) -> Style:
     """A random style."""
-    grey = rng.uniform(0.30, 0.52)
-    warm = rng.uniform(-0.012, 0.018)
+    grey = rng.uniform(0.28, 0.54)
+    warm = rng.uniform(-0.025, 0.035)
+    # Some roads are reddish, some bluish; a few are of pale concrete.
+    hue = np.array([warm, rng.uniform(-0.008, 0.008), -warm])
+    grey = grey + 0.08 if rng.random() < 0.12 else grey
     walk = rng.uniform(0.48, 0.64)
     green = rng.random() < 0.7
     dry = rng.uniform(0, 1)
@@ -40,7 +43,9 @@ def sample_style(rng: np.random.Generator) -> Style:
     paved = Surface((walk * 0.95, walk * 0.93, walk * 0.9), fine=0.25, coarse=0.25)
     return Style(
         asphalt=Surface(
-            (grey + warm, grey, grey - warm), fine=float(rng.uniform(0.25, 0.5)), coarse=float(rng.uniform(0.15, 0.5))
+            (float(grey + hue[0]), float(grey + hue[1]), float(grey + hue[2])),
+            fine=float(rng.uniform(0.25, 0.5)),
+            coarse=float(rng.uniform(0.15, 0.5)),
         ),
         walk=Surface((walk + 0.01, walk, walk - 0.015), fine=0.25, coarse=0.2),
         kerb=Surface((0.66, 0.66, 0.64), fine=0.2),
@@ -51,9 +56,12 @@ def sample_style(rng: np.random.Generator) -> Style:
 
 
 def lay_block(ground: MeshBuilder, outline: Array, far: Array, style: Style) -> Array:
-    """Land behind a kerb line (N, 2) with the land on the left: kerb, sidewalk, then ground up to ``far``."""
-    kerb_in = _offset(outline, 0.16)
-    walk_in = _offset(outline, style.walk_m)
+    """Land behind a kerb line (N, 2) with the land on the left: kerb, sidewalk, then ground up to ``far``.
+
+    far: one point (2,), or one for each point of the line (N, 2). Gives the sidewalk's inner edge (N, 2).
+    """
+    kerb_in = offset(outline, 0.16)
+    walk_in = offset(outline, style.walk_m)
 
     def lifted(line: Array, z: float) -> Array:
         return np.column_stack([line, np.full(len(line), z)])
@@ -61,24 +69,10 @@ def lay_block(ground: MeshBuilder, outline: Array, far: Array, style: Style) -> 
     ground.strip(lifted(outline, 0.0), lifted(outline, KERB_M), style.kerb)
     ground.strip(lifted(outline, KERB_M), lifted(kerb_in, KERB_M), style.kerb)
     ground.strip(lifted(kerb_in, KERB_M), lifted(walk_in, KERB_M), style.walk)
-    goal = np.broadcast_to(np.array([far[0], far[1], KERB_M]), (len(walk_in) - 1, 3))
+    goal = lifted(np.broadcast_to(far, walk_in.shape), KERB_M)
     edge = lifted(walk_in, KERB_M)
-    ground.quads(np.stack([edge[:-1], edge[1:], goal, goal], 1), style.verge)
+    ground.quads(np.stack([edge[:-1], edge[1:], goal[1:], goal[:-1]], 1), style.verge)
     return walk_in
-
-
-def _offset(line: Array, distance: float) -> Array:
-    """A polyline (N, 2) shifted to its left."""
-    step = np.empty_like(line)
-    segments = np.diff(line, axis=0)
-    segments /= np.linalg.norm(segments, axis=1, keepdims=True)
-    step[0], step[-1] = segments[0], segments[-1]
-    step[1:-1] = segments[:-1] + segments[1:]
-    step /= np.linalg.norm(step, axis=1, keepdims=True)
-    normal = np.stack([-step[:, 1], step[:, 0]], 1)
-    cosine = np.ones(len(line))
-    cosine[1:-1] = np.einsum("ij,ij->i", step[1:-1], segments[:-1])
-    return line + normal * (distance / cosine)[:, None]
 
 
 def lay_asphalt(ground: MeshBuilder, style: Style) -> None:
@@ -134,3 +128,28 @@ def arrow(ground: MeshBuilder, R: Array, x: float, y: float) -> None:
     paint(ground, R, (x + 1.2, x + 4.0), (y - 0.08, y + 0.08))
     corners = np.array([[x, y], [x + 1.3, y - 0.38], [x + 1.3, y + 0.38], [x + 1.3, y + 0.38]]) @ R.T
     ground.quads(np.column_stack([corners, np.full(4, PAINT_Z_M)]), WHITE)
+
+
+def line_along(
+    ground: MeshBuilder,
+    line: Array,
+    y: float,
+    width: float = 0.12,
+    dash: float = 0.0,
+    gap: float = 0.0,
+    surface: Surface = WHITE,
+) -> None:
+    """A painted line at ``y`` metres left of a polyline (N, 2), broken when ``gap`` is positive."""
+    low, high = offset(line, y - width / 2), offset(line, y + width / 2)
+    quads = np.stack([low[:-1], low[1:], high[1:], high[:-1]], 1)
+    if gap > 0:
+        distance = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])[:-1]
+        quads = quads[distance % (dash + gap) < dash]
+    z = np.full((*quads.shape[:2], 1), PAINT_Z_M)
+    ground.quads(np.concatenate([quads, z], -1), surface)
+
+
+def crosswalk(ground: MeshBuilder, R: Array, x: float, width: float) -> None:
+    """Stripes across a road from -width to width, from ``x`` on 3.2 m deep, in a frame turned by R (2, 2)."""
+    for y in np.arange(-width + 0.5, width - 0.5, 1.0):
+        paint(ground, R, (x, x + 3.2), (y, y + 0.5))

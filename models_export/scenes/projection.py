@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from models_export.scenes.mesh import Array
 from service.geometry.camera import Camera
-from service.geometry.transforms import rigid, rotation_z
+from service.geometry.transforms import rigid, rotation_z, transform_points
 
 NEAR_M, FAR_M = 0.5, 500.0
 
@@ -35,9 +36,26 @@ def crop_clip(camera: Camera, xyxy_px: Array) -> Array:
     return M
 
 
-def model_matrix(pose: Array, height_m: float) -> Array:
-    """``world_from_model`` (4, 4) of a vehicle with pose x, y, yaw standing on z = 0."""
-    return rigid(rotation_z(pose[2]), [pose[0], pose[1], 0.5 * height_m])
+def model_matrix(pose: Array, height_m: float, ground_m: float = 0.0) -> Array:
+    """``world_from_model`` (4, 4) of something with pose x, y, yaw that stands on z = ``ground_m``."""
+    return rigid(rotation_z(pose[2]), [pose[0], pose[1], ground_m + 0.5 * height_m])
+
+
+def in_view(camera: Camera, boxes: Array) -> NDArray[np.bool_]:
+    """Which of N things may be in a picture: (N,). boxes: (N, 6) x, y, yaw, length, width, ground height.
+
+    Everything within a ball that holds the thing counts, so that nothing is missed.
+    """
+    reach = 0.5 * np.hypot(boxes[:, 3], boxes[:, 4]) + 2.0
+    points = transform_points(camera.T_cam_world, np.column_stack([boxes[:, :2], boxes[:, 5] + 1.0]))
+    x, y, z = points.T
+    K, inside = camera.K, z > NEAR_M - reach
+    for pixel, low, high, axis in ((x, -0.5, camera.width - 0.5, 0), (y, -0.5, camera.height - 0.5, 1)):
+        for edge, sign in ((low, 1.0), (high, -1.0)):
+            slope = (edge - K[axis, 2]) / K[axis, axis]
+            # Signed distance from the plane through the eye and the picture's edge.
+            inside &= sign * (pixel - slope * z) / np.hypot(1.0, slope) > -reach
+    return np.asarray(inside)
 
 
 def sun_clip(toward: Array, reach_m: float) -> Array:

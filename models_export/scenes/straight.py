@@ -1,12 +1,25 @@
-"""The straight road: one to three lanes a side, with or without parking."""
+"""The straight road: one to three lanes a side, with or without parking and a crosswalk with lights."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from models_export.scenes.layout import REACH_M, Bay, RoadWorld, Route, plot, resampled
+from models_export.scenes.layout import REACH_M, Bay, RoadWorld, Route, offset, plot, resampled
 from models_export.scenes.mesh import Array, MeshBuilder
-from models_export.scenes.pavement import KERB_M, Style, dashes, lay_asphalt, lay_block, lay_wear, paint, sample_style
+from models_export.scenes.pavement import (
+    KERB_M,
+    Style,
+    crosswalk,
+    dashes,
+    lay_asphalt,
+    lay_block,
+    lay_wear,
+    paint,
+    sample_style,
+)
+
+_STOP_M = 4.5
+"""Distance of a stop line from the middle of a crosswalk."""
 
 
 def straight(rng: np.random.Generator) -> RoadWorld:
@@ -18,9 +31,9 @@ def straight(rng: np.random.Generator) -> RoadWorld:
     half = edge + (2.3 if parking else 0.4)
     far = REACH_M + 20
     ground = MeshBuilder()
-    for side in (1, -1):
-        line = np.array([[-far, half], [far, half]]) if side > 0 else np.array([[far, -half], [-far, -half]])
-        _block_strip(ground, line, style)
+    kerbs = (np.array([[-far, half], [far, half]]), np.array([[far, -half], [-far, -half]]))
+    for line in kerbs:
+        lay_block(ground, line, np.column_stack([line[:, 0], np.sign(line[:, 1]) * far]), style)
     lay_asphalt(ground, style)
     lay_wear(ground, style, (half, 0.0), rng)
     eye = np.eye(2)
@@ -33,31 +46,45 @@ def straight(rng: np.random.Generator) -> RoadWorld:
         for k in range(1, lanes):
             dashes(ground, eye, (-far, far), side * k * style.lane_m, 3.0, 6.0)
         paint(ground, eye, (-far, far), (side * edge - 0.06, side * edge + 0.06))
-    routes = _straight_routes(lanes, style, rng)
+    lights = bool(rng.random() < 0.4)
+    if lights:
+        crosswalk(ground, eye, -1.6, half)
+        for side in (1, -1):
+            x = side * _STOP_M
+            paint(ground, eye, (x - 0.22, x + 0.22), tuple(sorted((side * 0.2, side * edge))))
     bays = [
-        Bay(float(x), s * (half - 1.12), 0.0 if s < 0 else np.pi) for x in np.arange(-54, 55, 6.2) for s in (1, -1) if parking
+        Bay(float(x), s * (half - 1.12), 0.0 if s < 0 else np.pi)
+        for x in np.arange(-54, 55, 6.2)
+        for s in (1, -1)
+        if parking and not (lights and abs(x) < 9)
     ]
     set_back = half + style.walk_m + float(rng.uniform(2.5, 9))
     plots = [plot(1, s, (x, set_back), (x + 20, set_back + 16)) for x in np.arange(-110.0, 110.0, 22.0) for s in (1, -1)]
-    return RoadWorld("straight", ground, tuple(routes), tuple(bays), tuple(plots), _roadside_poles(half, rng), 0)
+    return RoadWorld(
+        "straight",
+        ground,
+        tuple(_straight_routes(lanes, style, lights, rng)),
+        tuple(bays),
+        tuple(plots),
+        _roadside_poles(half, rng),
+        2 if lights else 0,
+        (0.0,),
+        tuple(offset(line, style.walk_m * share) for line in kerbs for share in (0.35, 0.7)),
+        KERB_M,
+        kerbs,
+    )
 
 
-def _block_strip(ground: MeshBuilder, line: Array, style: Style) -> None:
-    """Land along a straight kerb line (2, 2), on its left."""
-    walk_in = lay_block(ground, line, np.array([0.0, np.sign(line[0, 1]) * (REACH_M + 20)]), style)
-    outer = walk_in * np.array([1.0, 0.0]) + [0, np.sign(line[0, 1]) * (REACH_M + 20)]
-    corners = np.column_stack([np.stack([walk_in[0], walk_in[1], outer[1], outer[0]]), np.full(4, KERB_M)])
-    ground.quads(corners, style.verge)
-
-
-def _straight_routes(lanes: int, style: Style, rng: np.random.Generator) -> list[Route]:
+def _straight_routes(lanes: int, style: Style, lights: bool, rng: np.random.Generator) -> list[Route]:
+    """Lanes both ways. With lights all of them are group 0, and group 1 is the people who cross."""
     routes = []
     speed = float(rng.uniform(9.0, 17.0))
+    group, stop = (0, REACH_M - _STOP_M - 0.6) if lights else (-1, np.inf)
     for side in (1, -1):
         for k in range(lanes):
             y = side * (k + 0.5) * style.lane_m
             way = np.array([[REACH_M * side, y], [-REACH_M * side, y]])
-            routes.append(Route(resampled(way), -1, np.inf, speed * (1.08 - 0.06 * k), speed, (0.0, 0.0)))
+            routes.append(Route(resampled(way), group, stop, speed * (1.08 - 0.06 * k), speed, (0.0, 0.0)))
     return routes
 
 

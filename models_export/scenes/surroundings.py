@@ -1,10 +1,10 @@
-"""What stands beside the road: buildings, trees, lamp posts, and the poles of the cameras."""
+"""What stands beside the road: buildings, trees, street lamps, and the poles of the cameras."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from models_export.scenes.layout import Plot, RoadWorld
+from models_export.scenes.layout import Plot, RoadWorld, offset
 from models_export.scenes.mesh import Array, MeshBuilder, Surface
 from models_export.scenes.pavement import KERB_M
 
@@ -19,22 +19,60 @@ _WALLS = (
 _BASE_M = KERB_M
 
 
-def furnish(world: RoadWorld, rng: np.random.Generator) -> None:
-    """Add buildings, trees and posts to a world's ground."""
-    built = rng.uniform(0.35, 0.9)
+def furnish(world: RoadWorld, rng: np.random.Generator) -> Array:
+    """Add buildings, trees and posts to a world's ground; gives the heads of its lamps (N, 3)."""
+    for foot, _ in world.poles if not world.indoor else ():
+        # Behind the camera, so that the pole is not in its own picture.
+        _post(world.ground, foot + 0.35 * foot / np.linalg.norm(foot), 4.8)
+    if world.ceiling_lamps is not None:
+        return world.ceiling_lamps
+    built, lit = rng.uniform(0.35, 0.9), float(rng.uniform(0.05, 0.5))
     for plot in world.plots:
         if rng.random() < built:
-            _building(world.ground, plot, rng)
+            _building(world.ground, plot, lit, rng)
         else:
             for _ in range(int(rng.integers(0, 4))):
                 x, y = (rng.uniform(lo, hi) for lo, hi in zip(plot.low, plot.high, strict=True))
                 _tree(world.ground, x, y, rng)
-    for foot, _ in world.poles:
-        # Behind the camera, so that the pole is not in its own picture.
-        _post(world.ground, foot + 0.35 * foot / np.linalg.norm(foot), 4.8)
     _row(world, rng)
     _clutter(world, rng)
     _skyline(world.ground, rng)
+    return _street_lamps(world, rng)
+
+
+def _street_lamps(world: RoadWorld, rng: np.random.Generator) -> Array:
+    """Lamp posts along the kerbs, their arms over the road."""
+    gap, height, arm = rng.uniform(22, 36), float(rng.uniform(6.5, 10.0)), float(rng.uniform(1.0, 2.2))
+    feet = np.array([foot for foot, _ in world.poles])
+    heads = []
+    for line in world.kerbs:
+        steps = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+        post, head = offset(line, 0.45), offset(line, -arm)
+        for place in np.arange(rng.uniform(0, gap), steps[-1], gap):
+            foot, tip = (np.array([np.interp(place, steps, ends[:, k]) for k in range(2)]) for ends in (post, head))
+            if np.abs(foot).max() < 75 and np.linalg.norm(feet - foot, axis=1).min() > 4.0:
+                _lamp_post(world.ground, foot, tip, height)
+                heads.append([*tip, height - 0.1])
+    return np.array(heads).reshape(-1, 3)
+
+
+def _lamp_post(mesh: MeshBuilder, foot: Array, tip: Array, height: float) -> None:
+    steel = Surface((0.42, 0.43, 0.44), gloss=0.2)
+    _tube(mesh, foot, 0.08, 0.0, height, steel)
+    along = (tip - foot) / np.linalg.norm(tip - foot)
+    side = 0.05 * np.array([-along[1], along[0]])
+    arm = np.array([foot + side, foot - side, tip - side, tip + side])
+    mesh.prism(arm[::-1] if _turns_right(arm) else arm, height - 0.06, height + 0.02, steel)
+    head = np.array([tip - 0.5 * along + 2.4 * side, tip - 0.5 * along - 2.4 * side, tip - 2.4 * side, tip + 2.4 * side])
+    head = head[::-1] if _turns_right(head) else head
+    mesh.prism(head, height - 0.05, height + 0.06, steel)
+    pane = np.column_stack([head[::-1], np.full(4, height - 0.06)])
+    mesh.quads(pane, Surface((0.9, 0.9, 0.85), glow=1.0, glass=1.0))
+
+
+def _turns_right(ring: Array) -> bool:
+    (x0, y0), (x1, y1), (x2, y2) = ring[:3]
+    return bool((x1 - x0) * (y2 - y1) - (y1 - y0) * (x2 - x1) < 0)
 
 
 def _skyline(mesh: MeshBuilder, rng: np.random.Generator) -> None:
@@ -53,7 +91,7 @@ def _skyline(mesh: MeshBuilder, rng: np.random.Generator) -> None:
 
 
 def _clutter(world: RoadWorld, rng: np.random.Generator) -> None:
-    """Things that are not vehicles: bins, cabinets, hedges, signs, people on the sidewalk."""
+    """Things that are not vehicles: bins, cabinets, hedges, signs."""
     for plot in world.plots:
         low, high = np.array(plot.low), np.array(plot.high)
         if np.abs(np.clip(np.zeros(2), low, high)).max() > 60:
@@ -76,13 +114,11 @@ def _thing(mesh: MeshBuilder, spot: Array, rng: np.random.Generator) -> None:
     elif kind < 0.45:
         hedge = Surface((0.18, 0.27, 0.12), fine=0.9, coarse=0.3).tinted(float(rng.uniform(0.8, 1.2)))
         _body(mesh, spot, (rng.uniform(0.8, 4.0), rng.uniform(0.8, 1.4), rng.uniform(0.6, 1.3)), hedge)
-    elif kind < 0.7:
+    else:
         _post(mesh, spot, 2.6)
         plate = Surface(((0.7, 0.1, 0.1), (0.1, 0.25, 0.6), (0.85, 0.85, 0.8))[rng.integers(3)], gloss=0.2)
         mesh.box([spot[0] - 0.3, spot[1] - 0.3, 2.0], [spot[0] + 0.3, spot[1] - 0.22, 2.7], plate)
         mesh.box([spot[0] - 0.3, spot[1] + 0.22, 2.0], [spot[0] + 0.3, spot[1] + 0.3, 2.7], plate)
-    else:
-        _person(mesh, spot, shade, rng)
 
 
 def _body(mesh: MeshBuilder, spot: Array, size: tuple[float, float, float], surface: Surface) -> None:
@@ -90,18 +126,8 @@ def _body(mesh: MeshBuilder, spot: Array, size: tuple[float, float, float], surf
     mesh.box([*(spot - half), _BASE_M], [*(spot + half), _BASE_M + size[2]], surface)
 
 
-def _person(mesh: MeshBuilder, spot: Array, coat: Surface, rng: np.random.Generator) -> None:
-    tall = rng.uniform(1.55, 1.9)
-    trousers = Surface(tuple(rng.uniform(0.1, 0.35, 3).tolist()))
-    skin = Surface((0.72, 0.54, 0.44)).tinted(float(rng.uniform(0.5, 1.15)))
-    for dx in (-0.1, 0.1):
-        _tube(mesh, spot + np.array([dx, 0.0]), 0.085, _BASE_M, _BASE_M + 0.48 * tall, trousers)
-    _tube(mesh, spot, 0.22, _BASE_M + 0.46 * tall, _BASE_M + 0.85 * tall, coat)
-    _tube(mesh, spot, 0.10, _BASE_M + 0.85 * tall, _BASE_M + tall, skin)
-
-
 def _row(world: RoadWorld, rng: np.random.Generator) -> None:
-    """Street trees and lamp posts between sidewalk and plots, away from the cameras."""
+    """Street trees and plain posts between sidewalk and plots, away from the cameras."""
     trees = rng.random() < 0.6
     feet = np.array([foot for foot, _ in world.poles])
     for plot in world.plots:
@@ -121,10 +147,11 @@ def _row(world: RoadWorld, rng: np.random.Generator) -> None:
 
 def _beside_road(world: RoadWorld, spot: Array) -> bool:
     """Whether a spot is well clear of every route."""
-    return all(np.abs(route.points - spot).max(1).min() > 2.6 for route in world.routes)
+    return world.clear_of_routes(spot) > 2.6
 
 
-def _building(mesh: MeshBuilder, plot: Plot, rng: np.random.Generator) -> None:
+def _building(mesh: MeshBuilder, plot: Plot, lit: float, rng: np.random.Generator) -> None:
+    """A block of two to six floors; ``lit`` is the share of windows with light behind them."""
     low, high = np.array(plot.low), np.array(plot.high)
     low, high = low + rng.uniform(0, 1.5, 2), high - rng.uniform(0, 2.5, 2)
     floors = int(rng.integers(2, 7))
@@ -142,7 +169,7 @@ def _building(mesh: MeshBuilder, plot: Plot, rng: np.random.Generator) -> None:
         wide = pitch
     shop = rng.random() < 0.4
     for side in range(4):
-        _windows(mesh, low, high, side, floors, storey, pitch, (wide, tall), shop, rng)
+        _windows(mesh, low, high, side, floors, storey, pitch, (wide, tall), shop, lit, rng)
 
 
 def _windows(
@@ -155,6 +182,7 @@ def _windows(
     pitch: float,
     size: tuple[float, float],
     shop: bool,
+    lit: float,
     rng: np.random.Generator,
 ) -> None:
     """Panes on one wall, a few centimetres proud of it; some lit or curtained."""
@@ -173,7 +201,8 @@ def _windows(
         for k in range(count):
             middle = start + offset + k * pitch
             shade = rng.uniform(0.05, 0.2) if rng.random() < 0.75 else rng.uniform(0.3, 0.55)
-            pane = Surface((shade, shade * 1.03, shade * 1.08), gloss=0.9, glass=1.0)
+            glow = float(rng.uniform(0.1, 0.8)) if rng.random() < (0.8 if full else lit) else 0.0
+            pane = Surface((shade, shade * 1.03, shade * 1.08), gloss=0.9, glow=glow, glass=1.0)
             place = plane + 0.04 * outward
             a, b = (middle - width / 2, middle + width / 2)
             if (axis == 0) != (outward > 0):

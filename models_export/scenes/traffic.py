@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from models_export.scenes.actor import ActorModel
 from models_export.scenes.layout import REACH_M, SPACING_M, RoadWorld, Route
 from models_export.scenes.mesh import Array
-from models_export.scenes.vehicles import VehicleModel, sample_vehicle
+from models_export.scenes.vehicles import LONGEST_M, sample_vehicle
 
 ENTRY_M = 85.0
 """Vehicles come in and leave at about this distance from the origin."""
@@ -21,6 +22,10 @@ _HARD_GAP_M = 0.6
 _SIDE_GAP_M = 0.35
 _YELLOW_S = 3.0
 _FREE_M = 1e6
+_BAY_M = 5.6
+"""Longest vehicle that parks."""
+_PROBES = np.linspace(-0.5, 0.5, 7)
+"""Places along a vehicle where others look for it; close enough to find a bus that crosses."""
 
 
 @dataclass(eq=False)
@@ -28,7 +33,7 @@ class Vehicle:
     """One vehicle of the simulation."""
 
     id: int
-    model: VehicleModel
+    model: ActorModel
     route: Route | None
     """None for parked ones."""
     s_m: float = 0.0
@@ -46,7 +51,8 @@ class Vehicle:
         s = self.s_m if s_m is None else s_m
         axles = s + np.array([-0.30, 0.325]) * self.model.dims_lwh[0]
         ends = _along(self.route, axles)
-        sway = 0.22 * np.sin(axles / 17.0 + self.sway_phase)
+        # Wide vehicles have no room to wander in their lane.
+        sway = (0.22 if self.model.dims_lwh[1] < 2.06 else 0.06) * np.sin(axles / 17.0 + self.sway_phase)
         heading = np.arctan2(*(ends[1] - ends[0])[::-1])
         ends = ends + sway[:, None] * np.array([-np.sin(heading), np.cos(heading)])
         heading = np.arctan2(*(ends[1] - ends[0])[::-1])
@@ -97,11 +103,16 @@ class Traffic:
     moving: int
     parked: int
     lamps_on: bool = False
+    turning: bool | None = None
+    """True lets only vehicles in that turn where they can, False only such that go straight on, None all."""
     vehicles: list[Vehicle] = field(default_factory=list)
     _next_id: int = 1
     _lights: _Lights | None = None
+    _routes: tuple[Route, ...] = ()
 
     def __post_init__(self) -> None:
+        chosen = tuple(r for r in self.world.routes if self.turning is None or r.turns == self.turning)
+        self._routes = chosen or self.world.routes
         if self.world.phases:
             phase = int(self.rng.integers(self.world.phases))
             self._lights = _Lights(self.world.phases, float(self.rng.uniform(7, 12)), phase, float(self.rng.uniform(4, 12)))
@@ -109,7 +120,7 @@ class Traffic:
         for bay in (self.world.bays[k] for k in bays):
             x, y = bay.x + self.rng.normal(0, 0.25), bay.y + self.rng.normal(0, 0.05)
             backwards = np.pi if self.rng.random() < 0.12 else 0.0
-            vehicle = self._new(None)
+            vehicle = self._new(None, _BAY_M)
             vehicle.parked_pose = (float(x), float(y), float(bay.yaw + backwards + self.rng.normal(0, 0.02)))
             self.vehicles.append(vehicle)
         for _ in range(40 * self.moving):
@@ -123,10 +134,10 @@ class Traffic:
         for _ in range(count):
             self._advance(seconds / count)
 
-    def _new(self, route: Route | None) -> Vehicle:
+    def _new(self, route: Route | None, longest_m: float) -> Vehicle:
         vehicle = Vehicle(
             self._next_id,
-            sample_vehicle(self.rng, lamps_on=self.lamps_on and route is not None),
+            sample_vehicle(self.rng, lamps_on=self.lamps_on and route is not None, longest_m=min(longest_m, LONGEST_M)),
             route,
             eagerness=float(self.rng.uniform(0.75, 1.15)),
             sway_phase=float(self.rng.uniform(0, 2 * np.pi)),
@@ -135,7 +146,7 @@ class Traffic:
         return vehicle
 
     def _try_spawn(self, *, anywhere: bool) -> None:
-        route = self.world.routes[self.rng.integers(len(self.world.routes))]
+        route = self._routes[self.rng.integers(len(self._routes))]
         first = REACH_M - ENTRY_M
         end = route.length_m - first
         vehicle = None
@@ -144,9 +155,11 @@ class Traffic:
         in_box = route.stop_at_m - 14 < s < route.stop_at_m + 50
         if not (anywhere and in_box):
             place = _along(route, np.array([s]))[0]
-            others = [v.pose()[:2] for v in self.vehicles if v.route is not None]
-            if all(np.hypot(*(o - place)) > (9.0 if anywhere else 14.0) or _beside(o, place, route, s) for o in others):
-                vehicle = self._new(route)
+            others = [(v.pose()[:2], v.model.dims_lwh[0]) for v in self.vehicles if v.route is not None]
+            candidate = self._new(route, route.longest_m)
+            room = 0.5 * candidate.model.dims_lwh[0] + (4.5 if anywhere else 9.5)
+            if all(np.hypot(*(o - place)) > room + 0.5 * long or _beside(o, place, route, s) for o, long in others):
+                vehicle = candidate
         if vehicle is not None:
             vehicle.s_m = s
             vehicle.speed_mps = route.speed_mps * vehicle.eagerness * (0.5 if anywhere else 0.9)
@@ -202,9 +215,9 @@ class _Snapshot:
     """Where N vehicles are at one instant."""
 
     points: Array
-    """(3 N, 2) rear, middle and front of every vehicle."""
+    """(7 N, 2) from rear to front of every vehicle."""
     owner: NDArray[np.int64]
-    """(3 N,) whose they are."""
+    """(7 N,) whose they are."""
     widths: Array
     speeds: Array
     headings: Array
@@ -213,11 +226,11 @@ class _Snapshot:
 def _snapshot(movers: list[Vehicle]) -> _Snapshot:
     poses = np.array([v.pose() for v in movers]).reshape(-1, 3)
     dims = np.array([v.model.dims_lwh for v in movers]).reshape(-1, 3)
-    shifts = np.array([-0.5, 0.0, 0.5]) * dims[:, :1]
+    shifts = _PROBES * dims[:, :1]
     direction = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], 1)
     points = poses[:, None, :2] + shifts[..., None] * direction[:, None]
     speeds = np.array([v.speed_mps for v in movers])
-    return _Snapshot(points.reshape(-1, 2), np.repeat(np.arange(len(movers)), 3), dims[:, 1], speeds, poses[:, 2])
+    return _Snapshot(points.reshape(-1, 2), np.repeat(np.arange(len(movers)), len(_PROBES)), dims[:, 1], speeds, poses[:, 2])
 
 
 def _gap_ahead(i: int, v: Vehicle, now: _Snapshot) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""What is known exactly of a rendered step: how much of each vehicle each camera sees, and its KITTI labels."""
+"""What is known exactly of a rendered step: how much of each road user each camera sees, and its KITTI labels."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import numpy as np
 
 from models_export.data.dataset import SceneTruth
 from models_export.data.kitti import KittiObject, box_to_kitti, occlusion_level
+from models_export.scenes.lens import Lens
 from models_export.scenes.mesh import Array
-from models_export.scenes.renderer import TILE_PX, Renderer, Shot
+from models_export.scenes.renderer import TILE_PX, Cast, Renderer, Shot
 from service.geometry.boxes import clip_extents, project_extents
 from service.geometry.camera import Camera
 
@@ -19,21 +20,18 @@ _LEAST_VISIBLE = 0.001
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """One camera's view of N vehicles: visible fraction and truncation, (N,) each, as in ``SceneTruth``."""
+    """One camera's view of N road users: visible fraction and truncation, (N,) each, as in ``SceneTruth``."""
 
     visible: Array
     truncated: Array
 
 
-def measure_sight(
-    renderer: Renderer, camera: Camera, shot: Shot, ids: list[int], placed: dict[int, Array], boxes: tuple[Array, Array, Array]
-) -> Sight:
-    """Compare each vehicle's pixels in a shot with its silhouette alone.
+def measure_sight(renderer: Renderer, lens: Lens, shot: Shot, cast: Cast, boxes: tuple[Array, Array, Array]) -> Sight:
+    """Compare each road user's pixels in a shot of ``lens.source`` with its silhouette alone.
 
-    ids: of the N vehicles, in the order of the shot's instance numbers. placed: their ``world_from_model`` by id. boxes:
-    world centres (N, 3), sizes l, w, h (N, 3), yaw (N,).
+    boxes: world centres (N, 3), sizes l, w, h (N, 3), yaw (N,), in the order of the cast.
     """
-    count = len(ids)
+    camera, count = lens.source, len(cast.ids)
     visible, truncated = np.zeros(count), np.ones(count)
     xyxy, in_front = project_extents(camera, *boxes)
     xyxy = xyxy + _MARGIN_PX * np.array([-1, -1, 1, 1])
@@ -41,18 +39,17 @@ def measure_sight(
     candidates = np.flatnonzero(in_front & np.all(xyxy[:, :2] < limits, 1) & np.all(xyxy[:, 2:] > -0.5, 1))
     if not len(candidates):
         return Sight(visible, truncated)
-    pixels = np.bincount(shot.instance.ravel(), minlength=count + 1)[1:]
     rectangles = xyxy[candidates]
-    masks = renderer.silhouettes(camera, rectangles, [ids[k] for k in candidates], placed) > 0
+    masks = renderer.silhouettes(camera, rectangles, [cast.ids[k] for k in candidates], cast.placed) > 0
     width, height = TILE_PX
     sides = rectangles[:, 2:] - rectangles[:, :2]
     u = rectangles[:, :1] + (np.arange(width) + 0.5) / width * sides[:, :1]
     v = rectangles[:, 1:2] + (np.arange(height) + 0.5) / height * sides[:, 1:]
-    inside_u, inside_v = (u > -0.5) & (u < limits[0]), (v > -0.5) & (v < limits[1])
     area = sides.prod(1) / (width * height)
     alone = masks.sum((1, 2)) * area
-    within = np.einsum("nhw,nh,nw->n", masks, inside_v, inside_u, dtype=np.float64) * area
-    shown = pixels[candidates]
+    tiles = np.stack(np.broadcast_arrays(u[:, None, :], v[:, :, None]), -1)
+    within = (masks & lens.contains(tiles)).sum((1, 2)) * area
+    shown = lens.pixel_counts(shot, count)[candidates]
     seen = (within > 0) & (shown > _LEAST_VISIBLE * within)
     chosen = candidates[seen]
     visible[chosen] = np.clip(shown[seen] / within[seen], 0.0, 1.0)
@@ -61,7 +58,7 @@ def measure_sight(
 
 
 def kitti_labels(camera: Camera, index: int, truth: SceneTruth) -> list[KittiObject]:
-    """KITTI labels of the vehicles that camera number ``index`` of the scene sees, nearest first.
+    """KITTI labels of the road users that camera number ``index`` of the scene sees, nearest first.
 
     The 2D box is the extent of the projected 3D box, clipped to the image: what the lifting's geometry is about.
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.accuracy import score_clip
+from benchmarks.clip_score import score_clip
 from benchmarks.recordings import ROADSIDE_STEPS, RoadsideClip, open_roadside_clip
 from service.errors import NotFoundError
 from service.nets.pack import load_pack
