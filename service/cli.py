@@ -31,6 +31,7 @@ _HELP = {
     "scenes": "Render simulated scenes for training and tests.",
     "train": "Train the networks.",
     "export": "Export trained networks to an ONNX pack.",
+    "carla": "Capture scenes from a CARLA server.",
 }
 
 app = typer.Typer(

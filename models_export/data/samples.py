@@ -19,6 +19,8 @@ from service.geometry.ground import GroundPlane
 from service.geometry.transforms import Array, wrap_angle
 from service.nets.canvas import to_canvas
 
+VEHICLES = ("car", "van", "truck", "bus")
+"""Classes that resemble each other: one that is not asked for is neither positive nor negative. Others are background."""
 MIN_VISIBLE = 0.3
 """Vehicles of which less is visible are neither positives nor negatives."""
 MIN_SIDE_PX = 5.0
@@ -93,19 +95,20 @@ def _load_sample(
     image = decode(scene.frame_bytes(camera.id, step), camera, max_width)
     scaled = camera.scaled(image.shape[1], image.shape[0])
     extents, in_front = project_extents(scaled, truth.center, truth.dims_lwh, truth.yaw)
-    seen = in_front & (truth.visible[:, camera_index] > 0) & np.isin([name.lower() for name in truth.classes], classes)
+    kinds = np.array([name.lower() for name in truth.classes])
+    seen = in_front & (truth.visible[:, camera_index] > 0) & (np.isin(kinds, classes) | np.isin(kinds, VEHICLES))
     xyxy = clip_extents(scaled, extents[seen])
     visible, truncated = truth.visible[seen, camera_index], truth.truncated[seen, camera_index]
     sides = xyxy[:, 2:] - xyxy[:, :2]
-    ignore = (visible < MIN_VISIBLE) | (sides.min(1, initial=np.inf) < MIN_SIDE_PX) | (truncated > MAX_TRUNCATED)
-    names = [truth.classes[i].lower() for i in np.nonzero(seen)[0]]
+    known = np.isin(kinds[seen], classes)
+    ignore = ~known | (visible < MIN_VISIBLE) | (sides.min(1, initial=np.inf) < MIN_SIDE_PX) | (truncated > MAX_TRUNCATED)
     return Sample(
         canvas=to_canvas(image),
         image_size=(image.shape[1], image.shape[0]),
         camera=scaled,
         xyxy_px=xyxy,
         ignore=ignore,
-        cls=np.array([classes.index(name) for name in names], dtype=np.int64),
+        cls=np.array([classes.index(kind) if kind in classes else 0 for kind in kinds[seen]], dtype=np.int64),
         dims_lwh=truth.dims_lwh[seen],
         alpha=wrap_angle(truth.yaw[seen] - ray_azimuth(scaled, (xyxy[:, :2] + xyxy[:, 2:]) / 2)),
         visible=visible,
