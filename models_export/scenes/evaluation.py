@@ -13,16 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
+from models_export.scenes.actor import ActorModel
 from models_export.scenes.cameras import RIGS
 from models_export.scenes.mesh import Array
 from models_export.scenes.plan import Moment, ScenePlan
 from models_export.scenes.request import FIRST_RESERVED_SEED, SceneRequest
 from models_export.scenes.scenario import SCENARIOS, STRAIGHT_WORLDS
+from models_export.scenes.vehicles import STYLES, sample_vehicle
 from models_export.scenes.writer import scene_document
 from service.errors import QuadliftError
 from service.site import site_document
 
-EVALUATION_SHA256 = "9070dae471dec0bf4967eff8c8e1cb7e714f5828942a6fc74f867a996bbea4d8"
+EVALUATION_SHA256 = "1192333835ef20e89ee143da47ccfe0f1b38d222ea3272412d12fd69336e9692"
 """Of the published set; :func:`evaluation_digest` must give it."""
 SCENES, STEPS, RATE_HZ = 10, 10, 5.0
 """Per scenario: 100 frame sets of four cameras."""
@@ -59,7 +61,7 @@ def evaluation_digest(scenarios: Iterable[str] = SCENARIOS) -> str:
 
     Pixels, and with them visible fractions, differ a little between OpenGL drivers; they are left out.
     """
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(json.dumps(_rounded(_fleet_description())).encode())
     for scenario in scenarios:
         for request in evaluation_requests(scenario):
             text = json.dumps(_description(ScenePlan(request)), sort_keys=True, separators=(",", ":"))
@@ -92,6 +94,16 @@ def _is_rendered(folder: Path, request: SceneRequest) -> bool:
     except json.JSONDecodeError:
         return False
     return bool(found == json.loads(json.dumps(scene_document(ScenePlan(request)))))
+
+
+def _fleet_description() -> list[object]:
+    """One body of each style: its size, number of faces and mean distances from its middle."""
+    rng, found = np.random.default_rng(0), dict[str, ActorModel]()
+    while len(found) < len(STYLES):
+        model = sample_vehicle(rng)
+        found.setdefault(model.shape, model)
+    bodies = [found[style.name] for style in STYLES]
+    return [[m.shape, m.dims_lwh, len(m.mesh), np.abs(m.mesh.corners).mean((0, 1)), m.mesh.looks.mean(0)] for m in bodies]
 
 
 def _description(plan: ScenePlan) -> object:

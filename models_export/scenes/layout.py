@@ -1,6 +1,6 @@
 """What a road world is made of: lanes to drive on, places to park, land to build on, poles for cameras.
 
-Everything is laid out with the roads along x and y; :mod:`models_export.scenes.generate` turns the whole world afterwards.
+Everything is laid out with the roads along x and y; :mod:`models_export.scenes.plan` turns the whole world afterwards.
 Traffic keeps to the right.
 """
 

@@ -36,16 +36,8 @@ def straight(rng: np.random.Generator) -> RoadWorld:
         lay_block(ground, line, np.column_stack([line[:, 0], np.sign(line[:, 1]) * far]), style)
     lay_asphalt(ground, style)
     lay_wear(ground, style, (half, 0.0), rng)
+    _markings(ground, lanes, style.lane_m, rng)
     eye = np.eye(2)
-    if rng.random() < 0.5:
-        for y in (-0.13, 0.13):
-            paint(ground, eye, (-far, far), (y - 0.06, y + 0.06))
-    else:
-        dashes(ground, eye, (-far, far), 0.0, 3.0, 6.0)
-    for side in (1, -1):
-        for k in range(1, lanes):
-            dashes(ground, eye, (-far, far), side * k * style.lane_m, 3.0, 6.0)
-        paint(ground, eye, (-far, far), (side * edge - 0.06, side * edge + 0.06))
     lights = bool(rng.random() < 0.4)
     if lights:
         crosswalk(ground, eye, -1.6, half)
@@ -69,6 +61,20 @@ def straight(rng: np.random.Generator) -> RoadWorld:
         KERB_M,
         kerbs,
     )
+
+
+def _markings(ground: MeshBuilder, lanes: int, lane_m: float, rng: np.random.Generator) -> None:
+    """Centre line, lane lines and edge lines."""
+    eye = np.eye(2)
+    if rng.random() < 0.5:
+        for y in (-0.13, 0.13):
+            paint(ground, eye, (-REACH_M - 20, REACH_M + 20), (y - 0.06, y + 0.06))
+    else:
+        dashes(ground, eye, (-REACH_M - 20, REACH_M + 20), 0.0, 3.0, 6.0)
+    for side in (1, -1):
+        for k in range(1, lanes):
+            dashes(ground, eye, (-REACH_M - 20, REACH_M + 20), side * k * lane_m, 3.0, 6.0)
+        paint(ground, eye, (-REACH_M - 20, REACH_M + 20), (side * lanes * lane_m - 0.06, side * lanes * lane_m + 0.06))
 
 
 def _straight_routes(lanes: int, style: Style, lights: bool, rng: np.random.Generator) -> list[Route]:
