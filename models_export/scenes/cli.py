@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from models_export.scenes.cameras import RIGS
+from models_export.scenes.evaluation import check_digest, evaluation_digest, evaluation_folder, missing_requests
 from models_export.scenes.light import WEATHERS
 from models_export.scenes.preview import contact_sheet, write_picture
 from models_export.scenes.renderer import Renderer
@@ -95,6 +96,27 @@ def render_all(requests: Sequence[SceneRequest], folders: Sequence[Path]) -> Non
                 progress.advance(task, len(step.shots))
     seconds = time.perf_counter() - started
     console.print(f"{images} images in {seconds:.1f} s: {images / seconds:.1f} images/s, scene set-up and files included")
+
+
+@app.command()
+def evaluation(
+    out: Annotated[Path, typer.Option(help="Cache folder; scenes that it holds already are kept.")],
+    scenario: Annotated[Scenario | None, typer.Option(help="Only one of the three sets.")] = None,
+    digest: Annotated[bool, typer.Option("--digest", help="Only print this generator's digest.")] = False,
+) -> None:
+    """Render the fixed evaluation set: easy, moderate and hard, 100 frame sets of four cameras each."""
+    if digest:
+        print(evaluation_digest())
+        return
+    try:
+        check_digest()
+        missing = missing_requests(out, SCENARIOS if scenario is None else (scenario.value,))
+        if missing:
+            render_all(missing, [out / evaluation_folder(r) for r in missing])
+    except QuadliftError as error:
+        console.print(f"[red]{error}")
+        raise typer.Exit(1) from error
+    console.print(f"{out} is complete: {len(missing)} scenes rendered")
 
 
 @app.command()

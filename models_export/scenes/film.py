@@ -47,7 +47,7 @@ class Film:
 def sample_film(rng: np.random.Generator, light: Light, quality: int | None = None) -> Film:
     """How one camera renders the light. Its JPEG quality is drawn from ``QUALITIES`` unless given."""
     exposure = 1.15 / (light.brightness**0.85 + 0.05) * np.exp(rng.normal(0, 0.25))
-    tint = np.exp(rng.normal(0, 0.05, 3))
+    tint = np.exp(rng.normal(0, 0.042, 3))
     night = light.weather in ("night", "night-rain", "dim")
     # Cameras do not make day of night, though they try.
     exposure *= rng.uniform(0.35, 0.9) if night else 1.0

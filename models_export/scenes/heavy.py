@@ -19,25 +19,9 @@ def build_bus(dims: Array, look: Look, accent: Surface) -> Mesh:
     builder, radius = MeshBuilder(), 0.48
     axles = (2.6 / length, 1 - 3.3 / length)
     pillars = np.arange(0.06, 0.97, 1.45 / length)
-    arches = [a + 1.1 * radius / length * _ARCH for a in axles]
-    f = stations([0, 0.003, 0.008, 0.016, 0.03, 0.97, 0.985, 0.995, 1], pillars, pillars + 0.11 / length, *arches)
-    x = length * (0.5 - f)
-    low = np.full(len(f), 0.30)
-    for axle in axles:
-        away = np.abs(x - length * (0.5 - axle))
-        low = np.where(away < 1.105 * radius, radius + np.sqrt(np.maximum((1.1 * radius) ** 2 - away**2, 0)), low)
-    half = 0.5 * width * curve([(0, 0.93), (0.003, 0.965), (0.008, 0.985), (0.02, 1), (0.985, 1), (1, 0.95)])(f)
-    roof = height * curve([(0, 0.955), (0.004, 0.975), (0.012, 0.99), (0.03, 1), (0.98, 1), (1, 0.97)])(f)
-    levels = np.array([0.0, 0.10, 0.26, 0.38, 0.62, 0.84, 0.90, 0.95])
-    widths = np.array([0.985, 1.0, 1.0, 1.0, 0.995, 0.985, 0.96, 0.91])
-    # Window lines run level above the wheel arches; only the lowest rows give way to them.
-    rows = np.maximum(0.30 + levels * (roof - 0.30)[:, None], low[:, None])
-    inward, upward = np.array([0.82, 0.45, 0.0]), np.array([0.985, 0.997, 1.0])
-    y = np.hstack([half[:, None] * widths, half[:, None] * inward])
-    z = np.hstack([rows, 0.30 + upward * (roof - 0.30)[:, None]])
-    rings = np.stack([np.broadcast_to(x[:, None], y.shape), y, z], -1)
+    f, rings = _bus_rings(length, width, height, axles, pillars, radius)
     middle = 0.5 * (f[1:] + f[:-1])
-    codes = np.full((len(middle), y.shape[1] - 1), _BODY, dtype=np.int64)
+    codes = np.full((len(middle), rings.shape[1] - 1), _BODY, dtype=np.int64)
     codes[:, 0] = _TRIM
     codes[:, 1:3] = _ACCENT
     pane = ~np.any(np.abs(middle[:, None] - (pillars + 0.055 / length)) < 0.056 / length, axis=1) & (middle > 0.008)
@@ -57,6 +41,29 @@ def build_bus(dims: Array, look: Look, accent: Surface) -> Mesh:
     add_cap(builder, rings[-1], lambda row, band: surface_of(row, band, False), front=False)
     _wheels(builder, [length * (0.5 - a) for a in axles], 0.49 * width, radius, look.rim_light)
     return builder.build(crease_rad=0.7).fitted(dims)
+
+
+def _bus_rings(
+    length: float, width: float, height: float, axles: tuple[float, float], pillars: Array, radius: float
+) -> tuple[Array, Array]:
+    """Places (S,) along a bus, and left half sections (S, R, 3)."""
+    arches = [a + 1.1 * radius / length * _ARCH for a in axles]
+    f = stations([0, 0.003, 0.008, 0.016, 0.03, 0.97, 0.985, 0.995, 1], pillars, pillars + 0.11 / length, *arches)
+    x = length * (0.5 - f)
+    low = np.full(len(f), 0.30)
+    for axle in axles:
+        away = np.abs(x - length * (0.5 - axle))
+        low = np.where(away < 1.105 * radius, radius + np.sqrt(np.maximum((1.1 * radius) ** 2 - away**2, 0)), low)
+    half = 0.5 * width * curve([(0, 0.93), (0.003, 0.965), (0.008, 0.985), (0.02, 1), (0.985, 1), (1, 0.95)])(f)
+    roof = height * curve([(0, 0.955), (0.004, 0.975), (0.012, 0.99), (0.03, 1), (0.98, 1), (1, 0.97)])(f)
+    levels = np.array([0.0, 0.10, 0.26, 0.38, 0.62, 0.84, 0.90, 0.95])
+    widths = np.array([0.985, 1.0, 1.0, 1.0, 0.995, 0.985, 0.96, 0.91])
+    # Window lines run level above the wheel arches; only the lowest rows give way to them.
+    rows = np.maximum(0.30 + levels * (roof - 0.30)[:, None], low[:, None])
+    inward, upward = np.array([0.82, 0.45, 0.0]), np.array([0.985, 0.997, 1.0])
+    y = np.hstack([half[:, None] * widths, half[:, None] * inward])
+    z = np.hstack([rows, 0.30 + upward * (roof - 0.30)[:, None]])
+    return f, np.stack([np.broadcast_to(x[:, None], y.shape), y, z], -1)
 
 
 def build_truck(dims: Array, look: Look, cargo: Surface) -> Mesh:
@@ -88,6 +95,30 @@ def _cab(
     builder: MeshBuilder, length: float, width: float, cab_m: float, height: float, axle_x: float, radius: float, look: Look
 ) -> None:
     ahead = 0.5 * length
+    f, rings = _cab_rings(ahead, width, cab_m, height, axle_x, radius)
+    middle = 0.5 * (f[1:] + f[:-1])
+    codes = np.full((len(middle), rings.shape[1] - 1), _BODY, dtype=np.int64)
+    codes[:, 0] = _TRIM
+    codes[np.ix_((middle > 0.34) & (middle < 0.76), [5, 6])] = _GLASS
+    codes[np.ix_((middle > 0.05) & (middle < 0.28), range(9, codes.shape[1]))] = _GLASS
+    codes[middle < 0.05, 2] = _HEAD
+    palette = (look.paint, TRIM, GLASS, head_lamp(look.lit), TRIM, TRIM)
+    add_skin(builder, rings, codes, palette)
+    add_floor(builder, rings, HOLLOW)
+
+    def surface_of(row: int, band: int) -> Surface:
+        if row == 2 and band != 1:
+            return palette[_HEAD]
+        return TRIM if row in (0, 2, 3) else look.paint
+
+    add_cap(builder, rings[0], surface_of, front=True)
+    add_cap(builder, rings[-1], lambda *_: look.paint, front=False)
+    add_plate(builder, float(rings[0, :, 0].max()), 0.55, front=True)
+    add_mirrors(builder, ahead - 0.22 * cab_m, 0.62 * height, width * 1.06, TRIM, tall=0.34)
+
+
+def _cab_rings(ahead: float, width: float, cab_m: float, height: float, axle_x: float, radius: float) -> tuple[Array, Array]:
+    """Places (S,) along a cab whose front is ``ahead`` metres before the middle, and left half sections (S, R, 3)."""
     f = stations(
         [0, 0.01, 0.04, 0.10, 0.18, 0.30, 0.34, 0.52, 0.76, 0.80, 0.94, 1], (ahead - axle_x + 1.1 * radius * _ARCH) / cab_m
     )
@@ -110,26 +141,7 @@ def _cab(
     y_up = half[:, None] * np.array([0.985, 0.97, 0.945, 0.92, 0.88])
     y = np.hstack([y_low, y_up, 0.88 * half[:, None] * across])
     z = np.hstack([z_low, z_up, z_roof])
-    rings = np.stack([np.broadcast_to(x[:, None], y.shape), y, z], -1)
-    middle = 0.5 * (f[1:] + f[:-1])
-    codes = np.full((len(middle), y.shape[1] - 1), _BODY, dtype=np.int64)
-    codes[:, 0] = _TRIM
-    codes[np.ix_((middle > 0.34) & (middle < 0.76), [5, 6])] = _GLASS
-    codes[np.ix_((middle > 0.05) & (middle < 0.28), range(9, codes.shape[1]))] = _GLASS
-    codes[middle < 0.05, 2] = _HEAD
-    palette = (look.paint, TRIM, GLASS, head_lamp(look.lit), TRIM, TRIM)
-    add_skin(builder, rings, codes, palette)
-    add_floor(builder, rings, HOLLOW)
-
-    def surface_of(row: int, band: int) -> Surface:
-        if row == 2 and band != 1:
-            return palette[_HEAD]
-        return TRIM if row in (0, 2, 3) else look.paint
-
-    add_cap(builder, rings[0], surface_of, front=True)
-    add_cap(builder, rings[-1], lambda *_: look.paint, front=False)
-    add_plate(builder, float(rings[0, :, 0].max()), 0.55, front=True)
-    add_mirrors(builder, ahead - 0.22 * cab_m, 0.62 * height, width * 1.06, TRIM, tall=0.34)
+    return f, np.stack([np.broadcast_to(x[:, None], y.shape), y, z], -1)
 
 
 def _cargo(

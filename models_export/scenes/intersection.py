@@ -6,7 +6,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models_export.scenes.layout import REACH_M, Bay, Plot, RoadWorld, Route, offset, plot, resampled, rounded, turned
+from models_export.scenes.layout import (
+    REACH_M,
+    Bay,
+    Kerbside,
+    Plot,
+    RoadWorld,
+    Route,
+    offset,
+    plot,
+    resampled,
+    rounded,
+    sample_kerbside,
+    turned,
+)
 from models_export.scenes.mesh import Array, MeshBuilder, Surface
 from models_export.scenes.pavement import (
     KERB_M,
@@ -35,14 +48,14 @@ class _Plan:
     style: Style
     lanes: tuple[int, int]
     """Lanes each way."""
-    parking: tuple[bool, bool]
+    parking: tuple[Kerbside, Kerbside]
     corner_m: float
     """Radius of the kerbs at the corners."""
     crosswalks: bool
 
     def half(self, road: int) -> float:
         """Half the width of a road between its kerbs."""
-        return self.lanes[road] * self.style.lane_m + (2.3 if self.parking[road] else 0.4)
+        return self.lanes[road] * self.style.lane_m + self.parking[road].depth_m
 
     def stop(self, arm: int) -> float:
         """Distance of an arm's stop line from the centre."""
@@ -69,7 +82,7 @@ def _crossing(kind: str, arms: tuple[int, ...], rng: np.random.Generator) -> Roa
         arms,
         sample_style(rng),
         (int(rng.integers(1, 3)), int(rng.integers(1, 3))),
-        (bool(rng.random() < 0.6), bool(rng.random() < 0.6)),
+        (sample_kerbside(rng, 0.6), sample_kerbside(rng, 0.6)),
         float(rng.uniform(4.5, 8.0)),
         bool(rng.random() < 0.8),
     )
@@ -88,7 +101,7 @@ def _crossing(kind: str, arms: tuple[int, ...], rng: np.random.Generator) -> Roa
     for arm in arms:
         _markings(ground, plan, arm, rng)
         routes += _routes(plan, arm, float(rng.uniform(9.0, 14.0)))
-    bays = [bay for arm in arms if plan.parking[arm % 2] for bay in _bays(plan, arm)]
+    bays = [bay for arm in arms for bay in _bays(plan, arm)]
     walks = tuple(offset(line, plan.style.walk_m * share) for line in kerbs for share in (0.35, 0.7))
     return RoadWorld(
         kind,
@@ -128,7 +141,7 @@ def _markings(ground: MeshBuilder, plan: _Plan, arm: int, rng: np.random.Generat
         for k in range(1, lanes):
             paint(ground, R, (stop, stop + 15), (side * k * lane - 0.06, side * k * lane + 0.06))
             dashes(ground, R, (stop + 18, REACH_M), side * k * lane, 2.0, 4.0)
-        if plan.parking[arm % 2]:
+        if plan.parking[arm % 2].parks:
             dashes(ground, R, (stop + 4, REACH_M), side * lanes * lane, 1.0, 1.0, 0.1)
     # Coming in along the arm means driving towards -x: the right-hand side is y > 0.
     paint(ground, R, (stop, stop + 0.45), (0.2, lanes * lane))
@@ -154,9 +167,9 @@ def _routes(plan: _Plan, arm: int, speed_mps: float) -> list[Route]:
     own, cross = plan.lanes[arm % 2], plan.lanes[1 - arm % 2]
     routes = []
 
-    def add(way: Array, turn_mps: float, curve: tuple[float, float], longest_m: float = np.inf) -> None:
+    def add(way: Array, turn_mps: float, curve: tuple[float, float], longest_m: float = np.inf, free: bool = False) -> None:
         stop, group = REACH_M - plan.stop(arm) - 0.7, plan.arms.index(arm)
-        routes.append(Route(resampled(way) @ R.T, group, stop, speed_mps, turn_mps, curve, longest_m))
+        routes.append(Route(resampled(way) @ R.T, group, stop, speed_mps, turn_mps, curve, longest_m, free))
 
     ahead, right, left = ((arm + k) % 4 in plan.arms for k in (2, 1, 3))
     for k in range(own):
@@ -166,7 +179,7 @@ def _routes(plan: _Plan, arm: int, speed_mps: float) -> list[Route]:
         if right and k == own - 1:
             x = (cross - 0.5) * lane
             way = rounded(np.array([[REACH_M, y], [x, y], [x, REACH_M]]), plan.corner_m + 0.5 * lane)
-            add(way, 5.5, (REACH_M - x - 9, REACH_M - x + 9), 7.0)
+            add(way, 5.5, (REACH_M - x - 9, REACH_M - x + 9), 7.0, True)
         if left and k == 0:
             x = -0.5 * lane
             way = rounded(np.array([[REACH_M, y], [x, y], [x, -REACH_M]]), (0.5 + cross) * lane + 2.0)
@@ -176,14 +189,10 @@ def _routes(plan: _Plan, arm: int, speed_mps: float) -> list[Route]:
 
 def _bays(plan: _Plan, arm: int) -> list[Bay]:
     """Kerbside places along both sides of an arm."""
-    R, start = turned(arm), plan.stop(arm) + 5
-    bays = []
-    for x in np.arange(start, start + 48, 6.2):
-        for side in (1, -1):
-            px, py = R @ np.array([x, side * (plan.half(arm % 2) - 1.12)])
-            heading = R @ np.array([-side, 0.0])
-            bays.append(Bay(float(px), float(py), float(np.arctan2(heading[1], heading[0]))))
-    return bays
+    kerbside, start = plan.parking[arm % 2], plan.stop(arm) + 5
+    if not kerbside.parks:
+        return []
+    return kerbside.bays(np.arange(start, start + 48, kerbside.pitch_m), plan.half(arm % 2), turned(arm))
 
 
 def _plots(plan: _Plan, rng: np.random.Generator) -> tuple[Plot, ...]:

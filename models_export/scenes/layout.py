@@ -1,6 +1,6 @@
 """What a road world is made of: lanes to drive on, places to park, land to build on, poles for cameras.
 
-Everything is laid out with the roads along x and y; :mod:`models_export.scenes.generate` turns the whole world afterwards.
+Everything is laid out with the roads along x and y; :mod:`models_export.scenes.plan` turns the whole world afterwards.
 Traffic keeps to the right.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from models_export.scenes.mesh import Array, MeshBuilder
 
@@ -36,6 +37,8 @@ class Route:
     """Where the curve starts and ends along the route; an empty range for none."""
     longest_m: float = np.inf
     """Vehicles longer than this keep out: they would cut its curve."""
+    free: bool = False
+    """Whether it needs no lights as long as all vehicles are on such routes (right turns at a crossing)."""
 
     @property
     def turns(self) -> bool:
@@ -55,6 +58,47 @@ class Bay:
     x: float
     y: float
     yaw: float
+    longest_m: float = 5.6
+
+
+@dataclass(frozen=True)
+class Kerbside:
+    """How cars park along a road: not at all, along the kerb, or with their noses to it at an angle."""
+
+    depth_m: float
+    """Width of the strip between lanes and kerb; a mere gutter where nobody parks."""
+    pitch_m: float
+    """Distance between bays along the road; 0 for none."""
+    angle_rad: float
+    """How far cars are turned to the right of the traffic beside them."""
+
+    @property
+    def parks(self) -> bool:
+        """Whether there are bays."""
+        return self.pitch_m > 0
+
+    def bays(self, along: ArrayLike, half_m: float, R: Array) -> list[Bay]:
+        """Bays on both sides of a road along x of half width ``half_m``, at places along it, in a frame turned by R (2, 2)."""
+        bays = []
+        for x in np.atleast_1d(along):
+            for side in (1, -1):
+                px, py = R @ np.array([x, side * (half_m - 0.49 * self.depth_m)])
+                # Traffic keeps right: on the side y > 0 it drives towards -x.
+                ahead = R @ np.array([-side, 0.0])
+                yaw = float(np.arctan2(ahead[1], ahead[0])) - self.angle_rad
+                bays.append(Bay(float(px), float(py), yaw, 5.0 if self.angle_rad else 5.6))
+        return bays
+
+
+def sample_kerbside(rng: np.random.Generator, share: float) -> Kerbside:
+    """A random kerbside; on ``share`` of all roads people park, on a third of those at an angle."""
+    angle = float(np.deg2rad(rng.uniform(40, 70)))
+    kind = rng.random()
+    if kind > share:
+        return Kerbside(0.4, 0.0, 0.0)
+    if kind > share / 3:
+        return Kerbside(2.3, 6.2, 0.0)
+    return Kerbside(5.0 * np.sin(angle) + 2.0 * np.cos(angle) + 0.2, 2.65 / np.sin(angle), angle)
 
 
 @dataclass(frozen=True)

@@ -59,10 +59,11 @@ def sample_walkers(world: RoadWorld, rng: np.random.Generator, count: int) -> li
         line = resampled(world.walks[rng.integers(len(world.walks))])
         line = line[np.abs(line).max(1) < _REACH_M]
         rides = not world.indoor and rng.random() < _RIDERS
+        line = resampled(offset(line, float(rng.uniform(-0.4, 0.4))))
         model = _sample_cyclist(rng) if rides else _sample_pedestrian(rng)
         speed = rng.uniform(2.5, 5.5) if rides else (0.0 if rng.random() < 0.2 else rng.uniform(0.8, 1.7))
-        start, aside = float(rng.uniform(0, len(line))), float(rng.uniform(-0.4, 0.4))
-        walkers.append(Walker(FIRST_ID + k, model, offset(line, aside), start, float(speed), world.walk_z_m))
+        start = float(rng.uniform(0, len(line)))
+        walkers.append(Walker(FIRST_ID + k, model, line, start, float(speed), world.walk_z_m))
     return walkers
 
 

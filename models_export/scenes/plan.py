@@ -16,6 +16,7 @@ from models_export.scenes.mesh import Array, Mesh
 from models_export.scenes.people import Walker, sample_walkers
 from models_export.scenes.request import SceneRequest
 from models_export.scenes.roads import WORLDS, build_world
+from models_export.scenes.scenario import ROTATION_THRESHOLD_RAD, rotation_from_axes
 from models_export.scenes.surroundings import furnish
 from models_export.scenes.traffic import Traffic, Vehicle
 from service.geometry.transforms import rotation_z, wrap_angle
@@ -23,8 +24,10 @@ from service.site import OriginModel, Site
 
 START_NS = 1_767_225_600_000_000_000
 """Capture time of every scene's first step: 2026-01-01T00:00:00Z."""
-_CROWDED = 0.3
+_CROWDED = 0.15
 """Share of hard scenes that are hard by occlusion, in clear weather."""
+_TURNING, _NEAR_M = 3, 45.0
+"""A moderate scene starts when this many vehicles are rotated this near to the origin; fewer do where few drive."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +135,20 @@ class ScenePlan:
         turning = {"easy": False, "moderate": True}.get(request.scenario or "")
         traffic = Traffic(world, rng, total - parked, parked, lamps_on=self.light.lamps_on, turning=turning)
         traffic.step(float(rng.uniform(8.0, 20.0)))
+        if turning:
+            _await_turns(traffic)
         return traffic
+
+
+def _await_turns(traffic: Traffic) -> None:
+    """Let time pass until some vehicles are about to turn, for a minute at most."""
+    axes = traffic.world.axes_rad
+    for _ in range(240):
+        poses = np.array([v.pose() for v in traffic.vehicles if v.route is not None]).reshape(-1, 3)
+        rotated = rotation_from_axes(poses[:, 2], axes) > ROTATION_THRESHOLD_RAD
+        if np.sum(rotated & (np.abs(poses[:, :2]).max(1) < _NEAR_M)) >= min(_TURNING, 1 + len(poses) // 5):
+            return
+        traffic.step(0.25)
 
 
 def _draw_weather(request: SceneRequest, world: RoadWorld, rng: np.random.Generator) -> tuple[str | None, bool]:

@@ -192,7 +192,10 @@ class Renderer:
             ctx = self.context
             color, truth = ctx.texture(size, 4), ctx.texture(size, 2, dtype="u2")
             depth = ctx.depth_renderbuffer(size)
-            self._frames[size] = (ctx.framebuffer([color, truth], depth), ctx.framebuffer([color], depth))
+            picture = ctx.framebuffer([color], depth)
+            # Blended things lie over one another; none may hide the next.
+            picture.depth_mask = False
+            self._frames[size] = (ctx.framebuffer([color, truth], depth), picture)
         return self._frames[size]
 
     def _draw(

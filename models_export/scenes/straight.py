@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from models_export.scenes.layout import REACH_M, Bay, RoadWorld, Route, offset, plot, resampled
+from models_export.scenes.layout import REACH_M, RoadWorld, Route, offset, plot, resampled, sample_kerbside
 from models_export.scenes.mesh import Array, MeshBuilder
 from models_export.scenes.pavement import (
     KERB_M,
@@ -26,9 +26,9 @@ def straight(rng: np.random.Generator) -> RoadWorld:
     """A random straight road along x."""
     style = sample_style(rng)
     lanes = int(rng.choice([1, 2, 3], p=[0.3, 0.45, 0.25]))
-    parking = bool(rng.random() < 0.55)
+    kerbside = sample_kerbside(rng, 0.55)
     edge = lanes * style.lane_m
-    half = edge + (2.3 if parking else 0.4)
+    half = edge + kerbside.depth_m
     far = REACH_M + 20
     ground = MeshBuilder()
     kerbs = (np.array([[-far, half], [far, half]]), np.array([[far, -half], [-far, -half]]))
@@ -36,28 +36,16 @@ def straight(rng: np.random.Generator) -> RoadWorld:
         lay_block(ground, line, np.column_stack([line[:, 0], np.sign(line[:, 1]) * far]), style)
     lay_asphalt(ground, style)
     lay_wear(ground, style, (half, 0.0), rng)
+    _markings(ground, lanes, style.lane_m, rng)
     eye = np.eye(2)
-    if rng.random() < 0.5:
-        for y in (-0.13, 0.13):
-            paint(ground, eye, (-far, far), (y - 0.06, y + 0.06))
-    else:
-        dashes(ground, eye, (-far, far), 0.0, 3.0, 6.0)
-    for side in (1, -1):
-        for k in range(1, lanes):
-            dashes(ground, eye, (-far, far), side * k * style.lane_m, 3.0, 6.0)
-        paint(ground, eye, (-far, far), (side * edge - 0.06, side * edge + 0.06))
     lights = bool(rng.random() < 0.4)
     if lights:
         crosswalk(ground, eye, -1.6, half)
         for side in (1, -1):
             x = side * _STOP_M
             paint(ground, eye, (x - 0.22, x + 0.22), tuple(sorted((side * 0.2, side * edge))))
-    bays = [
-        Bay(float(x), s * (half - 1.12), 0.0 if s < 0 else np.pi)
-        for x in np.arange(-54, 55, 6.2)
-        for s in (1, -1)
-        if parking and not (lights and abs(x) < 9)
-    ]
+    places = np.arange(-54, 55, kerbside.pitch_m) if kerbside.parks else np.zeros(0)
+    bays = kerbside.bays(places[np.abs(places) > 9] if lights else places, half, eye)
     set_back = half + style.walk_m + float(rng.uniform(2.5, 9))
     plots = [plot(1, s, (x, set_back), (x + 20, set_back + 16)) for x in np.arange(-110.0, 110.0, 22.0) for s in (1, -1)]
     return RoadWorld(
@@ -73,6 +61,20 @@ def straight(rng: np.random.Generator) -> RoadWorld:
         KERB_M,
         kerbs,
     )
+
+
+def _markings(ground: MeshBuilder, lanes: int, lane_m: float, rng: np.random.Generator) -> None:
+    """Centre line, lane lines and edge lines."""
+    eye = np.eye(2)
+    if rng.random() < 0.5:
+        for y in (-0.13, 0.13):
+            paint(ground, eye, (-REACH_M - 20, REACH_M + 20), (y - 0.06, y + 0.06))
+    else:
+        dashes(ground, eye, (-REACH_M - 20, REACH_M + 20), 0.0, 3.0, 6.0)
+    for side in (1, -1):
+        for k in range(1, lanes):
+            dashes(ground, eye, (-REACH_M - 20, REACH_M + 20), side * k * lane_m, 3.0, 6.0)
+        paint(ground, eye, (-REACH_M - 20, REACH_M + 20), (side * lanes * lane_m - 0.06, side * lanes * lane_m + 0.06))
 
 
 def _straight_routes(lanes: int, style: Style, lights: bool, rng: np.random.Generator) -> list[Route]:

@@ -44,15 +44,17 @@ def _street_lamps(world: RoadWorld, rng: np.random.Generator) -> Array:
     """Lamp posts along the kerbs, their arms over the road."""
     gap, height, arm = rng.uniform(22, 36), float(rng.uniform(6.5, 10.0)), float(rng.uniform(1.0, 2.2))
     feet = np.array([foot for foot, _ in world.poles])
-    heads = []
+    heads: list[Array] = []
     for line in world.kerbs:
         steps = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
         post, head = offset(line, 0.45), offset(line, -arm)
         for place in np.arange(rng.uniform(0, gap), steps[-1], gap):
             foot, tip = (np.array([np.interp(place, steps, ends[:, k]) for k in range(2)]) for ends in (post, head))
-            if np.abs(foot).max() < 75 and np.linalg.norm(feet - foot, axis=1).min() > 4.0:
+            # At corners lines meet: a lamp there serves both roads.
+            crowded = any(np.hypot(*(tip - other[:2])) < 14.0 for other in heads)
+            if np.abs(foot).max() < 75 and np.linalg.norm(feet - foot, axis=1).min() > 4.0 and not crowded:
                 _lamp_post(world.ground, foot, tip, height)
-                heads.append([*tip, height - 0.1])
+                heads.append(np.array([*tip, height - 0.1]))
     return np.array(heads).reshape(-1, 3)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models_export.scenes.actor import ActorModel
-from models_export.scenes.layout import REACH_M, SPACING_M, RoadWorld, Route
+from models_export.scenes.layout import REACH_M, SPACING_M, Bay, RoadWorld, Route
 from models_export.scenes.mesh import Array
 from models_export.scenes.vehicles import LONGEST_M, sample_vehicle
 
@@ -22,8 +22,6 @@ _HARD_GAP_M = 0.6
 _SIDE_GAP_M = 0.35
 _YELLOW_S = 3.0
 _FREE_M = 1e6
-_BAY_M = 5.6
-"""Longest vehicle that parks."""
 _PROBES = np.linspace(-0.5, 0.5, 7)
 """Places along a vehicle where others look for it; close enough to find a bus that crosses."""
 
@@ -104,7 +102,7 @@ class Traffic:
     parked: int
     lamps_on: bool = False
     turning: bool | None = None
-    """True lets only vehicles in that turn where they can, False only such that go straight on, None all."""
+    """True lets only vehicles in that turn where they can; False only such that go straight on, and no angled parking."""
     vehicles: list[Vehicle] = field(default_factory=list)
     _next_id: int = 1
     _lights: _Lights | None = None
@@ -113,14 +111,18 @@ class Traffic:
     def __post_init__(self) -> None:
         chosen = tuple(r for r in self.world.routes if self.turning is None or r.turns == self.turning)
         self._routes = chosen or self.world.routes
-        if self.world.phases:
+        # Where all turn, many a crossing has right turns only: they flow from all sides without lights.
+        free = tuple(r for r in self._routes if r.free)
+        lively = bool(self.turning and free and self.rng.random() < 0.6)
+        self._routes = free if lively else self._routes
+        if self.world.phases and not lively:
             phase = int(self.rng.integers(self.world.phases))
             self._lights = _Lights(self.world.phases, float(self.rng.uniform(7, 12)), phase, float(self.rng.uniform(4, 12)))
-        bays = self.rng.permutation(len(self.world.bays))[: self.parked]
-        for bay in (self.world.bays[k] for k in bays):
+        bays = [b for b in self.world.bays if self.turning is not False or self._aligned(b)]
+        for bay in (bays[k] for k in self.rng.permutation(len(bays))[: self.parked]):
             x, y = bay.x + self.rng.normal(0, 0.25), bay.y + self.rng.normal(0, 0.05)
             backwards = np.pi if self.rng.random() < 0.12 else 0.0
-            vehicle = self._new(None, _BAY_M)
+            vehicle = self._new(None, bay.longest_m)
             vehicle.parked_pose = (float(x), float(y), float(bay.yaw + backwards + self.rng.normal(0, 0.02)))
             self.vehicles.append(vehicle)
         for _ in range(40 * self.moving):
@@ -133,6 +135,10 @@ class Traffic:
         count = max(1, int(np.ceil(seconds / _MAX_STEP_S - 1e-9)))
         for _ in range(count):
             self._advance(seconds / count)
+
+    def _aligned(self, bay: Bay) -> bool:
+        """Whether cars in a bay stand along a lane's direction."""
+        return any(abs(np.sin(bay.yaw - axis)) < 0.05 for axis in self.world.axes_rad)
 
     def _new(self, route: Route | None, longest_m: float) -> Vehicle:
         vehicle = Vehicle(

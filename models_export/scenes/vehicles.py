@@ -29,40 +29,30 @@ class Style:
     """None for trucks and buses, which are built otherwise."""
 
 
-def _car(*lines: float, windows: tuple[tuple[float, float], ...], **rest: float | bool) -> CarShape:
-    cowl, roof_front, roof_rear, tail, nose, belt, deck, roof_width = lines
-    return CarShape(cowl, roof_front, roof_rear, tail, nose, belt, deck, roof_width, windows, **rest)  # type: ignore[arg-type]
+_Spans = tuple[tuple[float, float], ...]
 
 
-_SEDAN = _car(0.29, 0.44, 0.69, 0.84, 0.49, 0.63, 0.67, 0.74, windows=((0.375, 0.53), (0.55, 0.70), (0.715, 0.76)))
-_HATCH = _car(0.25, 0.41, 0.84, 0.955, 0.51, 0.62, 0.65, 0.76, windows=((0.34, 0.55), (0.57, 0.75), (0.775, 0.86)))
-_WAGON = _car(
-    0.27, 0.41, 0.89, 0.97, 0.49, 0.62, 0.64, 0.76, windows=((0.355, 0.53), (0.55, 0.71), (0.73, 0.92)), tall_lamps=True
-)
-_SUV = _car(
-    0.26, 0.39, 0.87, 0.965, 0.55, 0.63, 0.65, 0.79, windows=((0.34, 0.52), (0.54, 0.70), (0.72, 0.89)), tall_lamps=True
-)
-_PICKUP = _car(
-    0.25, 0.37, 0.56, 0.60, 0.54, 0.63, 0.60, 0.78, windows=((0.325, 0.43), (0.45, 0.56)), axles=(0.17, 0.76), bed=True
-)
-_PANEL = _car(
-    0.16,
-    0.29,
-    0.965,
-    0.985,
-    0.46,
-    0.56,
-    0.57,
-    0.88,
-    windows=((0.235, 0.385),),
-    axles=(0.165, 0.785),
-    blind=True,
-    tall_lamps=True,
-)
-_MINIBUS = _car(
-    0.16, 0.29, 0.955, 0.985, 0.46, 0.56, 0.57, 0.87, windows=((0.235, 0.385), (0.405, 0.64), (0.66, 0.93)),
-    axles=(0.165, 0.785), tall_lamps=True,
-)  # fmt: skip
+def _car(
+    lines: tuple[float, float, float, float, float, float, float, float],
+    windows: _Spans,
+    *,
+    axles: tuple[float, float] = (0.175, 0.80),
+    blind: bool = False,
+    bed: bool = False,
+    tall_lamps: bool = False,
+) -> CarShape:
+    """``lines``: cowl, roof front and rear, tail, nose, belt, deck, roof width, as in ``CarShape``."""
+    return CarShape(*lines, windows, axles, blind, bed, tall_lamps)
+
+
+_SEDAN = _car((0.29, 0.44, 0.69, 0.84, 0.49, 0.63, 0.67, 0.74), ((0.375, 0.53), (0.55, 0.70), (0.715, 0.76)))
+_HATCH = _car((0.25, 0.41, 0.84, 0.955, 0.51, 0.62, 0.65, 0.76), ((0.34, 0.55), (0.57, 0.75), (0.775, 0.86)))
+_WAGON = _car((0.27, 0.41, 0.89, 0.97, 0.49, 0.62, 0.64, 0.76), ((0.355, 0.53), (0.55, 0.71), (0.73, 0.92)), tall_lamps=True)
+_SUV = _car((0.26, 0.39, 0.87, 0.965, 0.55, 0.63, 0.65, 0.79), ((0.34, 0.52), (0.54, 0.70), (0.72, 0.89)), tall_lamps=True)
+_PICKUP = _car((0.25, 0.37, 0.56, 0.60, 0.54, 0.63, 0.60, 0.78), ((0.325, 0.43), (0.45, 0.56)), axles=(0.17, 0.76), bed=True)
+_VAN_LINES, _VAN_AXLES = (0.16, 0.29, 0.955, 0.985, 0.46, 0.56, 0.57, 0.875), (0.165, 0.785)
+_PANEL = _car(_VAN_LINES, ((0.235, 0.385),), axles=_VAN_AXLES, blind=True, tall_lamps=True)
+_MINIBUS = _car(_VAN_LINES, ((0.235, 0.385), (0.405, 0.64), (0.66, 0.93)), axles=_VAN_AXLES, tall_lamps=True)
 
 STYLES = (
     Style("sedan", "car", 0.24, (4.3, 5.1), (1.74, 1.93), (1.40, 1.50), _SEDAN),

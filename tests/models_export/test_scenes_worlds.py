@@ -12,16 +12,19 @@ from models_export.scenes.light import INDOOR_WEATHERS, WEATHERS, sample_light
 from models_export.scenes.people import sample_walkers
 from models_export.scenes.request import FIRST_RESERVED_SEED, SceneRequest, parse_size, world_of
 from models_export.scenes.roads import WORLDS, build_world
+from models_export.scenes.scenario import rotation_from_axes
 from models_export.scenes.traffic import Traffic
 from service.errors import InputError
 from service.geometry.camera import Camera
 from service.geometry.iou import intersection_bev
 
 
-def run_traffic(kind: str, seed: int, moving: int, seconds: float, step: float) -> tuple[Traffic, dict[int, float]]:
+def run_traffic(
+    kind: str, seed: int, moving: int, seconds: float, step: float, turning: bool | None = None
+) -> tuple[Traffic, dict[int, float]]:
     """Traffic that is watched for overlaps while it runs, and how far each vehicle went."""
     rng = np.random.default_rng(seed)
-    traffic = Traffic(build_world(kind, rng), rng, moving=moving, parked=4)
+    traffic = Traffic(build_world(kind, rng), rng, moving=moving, parked=4, turning=turning)
     travelled: dict[int, float] = {}
     for _ in range(round(seconds / step)):
         before = {v.id: v.pose()[:2] for v in traffic.vehicles}
@@ -47,6 +50,13 @@ def test_vehicles_move_and_never_overlap(kind: str, seed: int) -> None:
     moved = [travelled.get(v.id, 0.0) for v in traffic.vehicles if v.route is not None]
     assert np.mean(moved) > (8 if kind == "garage" else 15)
     assert all(travelled[v.id] == 0 for v in traffic.vehicles if v.route is None)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("kind", ["intersection", "t-junction"])
+def test_turning_vehicles_never_overlap(kind: str, seed: int) -> None:
+    traffic, travelled = run_traffic(kind, seed, 14, 30.0, 0.5, turning=True)
+    assert np.mean([travelled.get(v.id, 0.0) for v in traffic.vehicles if v.route is not None]) > 10
 
 
 def test_queues_form_at_red_lights() -> None:
@@ -95,6 +105,19 @@ def test_traffic_of_one_scenario(turning: bool) -> None:
     rng = np.random.default_rng(1)
     traffic = Traffic(build_world("intersection", rng), rng, moving=10, parked=0, turning=turning)
     assert {v.route.turns for v in traffic.vehicles if v.route is not None} == {turning}
+
+
+def test_easy_traffic_has_no_angled_parking() -> None:
+    angled = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        world = build_world("straight", rng)
+        for turning in (False, None):
+            vehicles = Traffic(world, rng, moving=0, parked=8, turning=turning).vehicles
+            rotated = rotation_from_axes([v.pose()[2] for v in vehicles], world.axes_rad) > np.deg2rad(10)
+            assert not (rotated.any() and turning is False)
+            angled += int(rotated.sum())
+    assert angled > 0
 
 
 def test_long_vehicles_keep_to_routes_that_they_can_take() -> None:
