@@ -13,12 +13,12 @@ import numpy as np
 
 from models_export.data.dataset import step_name, write_truth
 from models_export.data.kitti import calib_of, write_calib, write_labels
+from models_export.data.labels import kitti_labels
 from models_export.scenes.film import develop, encode
 from models_export.scenes.generate import SceneMaker, Step
 from models_export.scenes.plan import ScenePlan
 from models_export.scenes.renderer import Renderer, Shot
 from models_export.scenes.request import SceneRequest
-from models_export.scenes.truth import kitti_labels
 from service.geometry.camera import Camera
 from service.site import save_site
 
