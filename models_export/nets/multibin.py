@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from models_export.nets.blocks import Normalise, conv, stage
 
@@ -51,5 +51,6 @@ class EdgeMultibin(nn.Module):
         """Bin vectors are (cos, sin) of the angle past the bin's centre, of length 1."""
         features = self.trunk(self.normalise(crops))
         vectors = self.orientation(features).reshape(-1, self.bins, 2)
-        vectors = vectors / torch.sqrt((vectors * vectors).sum(-1, keepdim=True) + 1e-8)
+        # Not x / sqrt(x^2 + eps): int8 rounds that sum to 0 now and then, and the quotient is then no number.
+        vectors = functional.normalize(vectors, dim=-1)
         return vectors, self.confidence(features), self.dimensions(features)

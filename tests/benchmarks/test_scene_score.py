@@ -79,10 +79,10 @@ def test_dropped_boxes_cost_recall_and_no_precision(dataset: Path, answering: Fa
 
 
 def test_a_golden_score(dataset: Path, answering: Factory) -> None:
-    """One exact result; if it moves, the scoring has changed."""
+    """One exact result; if it moves, the scoring has changed. (Tracking scores are pinned without a tracker, elsewhere.)"""
     view = summaries(score(dataset, answering(noise_m=0.2), (4,)))[ALL]["4"]
-    figures = [view["ap_3d"]["0.7"]["R11"], view["ap_3d"]["0.7"]["R40"], view["ap_bev"]["0.7"]["R40"], view["tracking"]["hota"]]
-    np.testing.assert_allclose(figures, [20.41, 17.75, 56.42, 52.68], atol=0.02)
+    figures = [view["ap_3d"]["0.7"]["R11"], view["ap_3d"]["0.7"]["R40"], view["ap_bev"]["0.7"]["R40"]]
+    np.testing.assert_allclose(figures, [20.41, 17.75, 56.42], atol=0.02)
 
 
 def test_no_answers_at_all(dataset: Path, answering: Factory) -> None:
