@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from service.depth_scale import DepthReadings, DepthScales, read_boxes
 from service.errors import FrameError
 from service.frames import FrameSet, decode
-from service.fusion import FusionSettings, fuse
+from service.fusion import FusedBoxes, FusionSettings, fuse
 from service.geometry.boxes import Boxes, clip_extents, cut_edges
 from service.geometry.camera import Camera, UInt8Image, yaw_from_alpha
 from service.lifting import LiftSettings, Measurements, lift
@@ -23,12 +24,16 @@ from service.nets.depth import DepthNet
 from service.nets.detector import Detections, Detector, edge_sigma
 from service.nets.multibin import Multibin, MultibinEstimates, crop_vehicles
 from service.nets.pack import Pack
+from service.paper_fusion import PaperFusionSettings, fuse_paper
+from service.site import Site
 
 
 @dataclass(frozen=True)
 class PipelineSettings:
     """What can be set of the pipeline; the rest comes from the pack and the site."""
 
+    method: Literal["map", "paper"] = "map"
+    """How boxes are lifted and fused: by maximum a posteriori and information, or as in the source paper."""
     score_threshold: float = 0.3
     """2D detections of a lower score are dropped."""
     nms_iou: float = 0.55
@@ -40,6 +45,7 @@ class PipelineSettings:
     camera alone sees, from far away, often beside their own box from the other cameras. ``per_camera`` has them."""
     lift: LiftSettings = field(default_factory=LiftSettings)
     fusion: FusionSettings = field(default_factory=FusionSettings)
+    paper_fusion: PaperFusionSettings = field(default_factory=PaperFusionSettings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,9 +107,9 @@ class Pipeline:
             readings = self._read_depth(frame_set, cameras, images, found)
         with _timed(timing, "lift"):
             measurements = self._measurements(cameras, found, estimates, readings)
-            lifted = lift(cameras, frame_set.site.ground, measurements, self.settings.lift)
+            lifted = self._lift(cameras, frame_set.site, measurements)
         with _timed(timing, "fuse"):
-            fused = fuse(lifted, measurements.camera_index, cameras, self.settings.fusion)
+            fused = self._fuse(lifted, measurements.camera_index, cameras)
             keep = self._reported(fused.boxes)
         timing["total"] = 1e3 * (time.perf_counter() - started)
         return SetResult(
@@ -116,6 +122,19 @@ class Pipeline:
             timing_ms=timing,
             failed=failed,
         )
+
+    def _lift(self, cameras: list[Camera], site: Site, measurements: Measurements) -> Boxes:
+        if self.settings.method == "paper":
+            # Imported here: the default method does not pay for it.
+            from service.paper_lifting import lift_paper
+
+            return lift_paper(cameras, site.ground, measurements, self.settings.lift)
+        return lift(cameras, site.ground, measurements, self.settings.lift)
+
+    def _fuse(self, lifted: Boxes, camera_index: NDArray[np.int64], cameras: list[Camera]) -> FusedBoxes:
+        if self.settings.method == "paper":
+            return fuse_paper(lifted, camera_index, cameras, self.settings.paper_fusion)
+        return fuse(lifted, camera_index, cameras, self.settings.fusion)
 
     def _reported(self, boxes: Boxes) -> NDArray[np.bool_]:
         sigma = np.sqrt(boxes.covariance[:, 0, 0] + boxes.covariance[:, 1, 1])
