@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.association import Index, best_of_duplicates, gated_assignment, mahalanobis_cost
-from service.geometry.boxes import STATE_DIM, Boxes, box_states, project_extents
+from service.geometry.boxes import STATE_DIM, Boxes, box_states
 from service.geometry.camera import Camera
 from service.geometry.transforms import Array, wrap_angle
+from service.views import whole_in_view
 
 _DIMS = slice(3, 6)
 
@@ -54,11 +55,9 @@ class FusionSettings:
     0.85 m off towards each other reach it."""
     duplicate_distance_m: float = 1.0
     """Centres nearer than this are one vehicle, metres."""
-    single_view_factor: float = 0.85
-    """Score factor of a box that one camera alone reports though at least ``silent_views`` others have it in full view.
-    Mild, for another vehicle may hide it from them."""
-    silent_views: int = 2
-    """How many other cameras must be silent for that."""
+    silence_ratio: float = 0.8
+    """How much likelier a camera is silent about a real vehicle in its full view than about a false alarm of another camera.
+    Near 1, for another vehicle may hide it."""
     view_range_m: float = 40.0
     """A camera is expected to report vehicles up to this distance, metres."""
 
@@ -66,8 +65,8 @@ class FusionSettings:
 def fuse(boxes: Boxes, camera_index: Index, cameras: Sequence[Camera], settings: FusionSettings | None = None) -> FusedBoxes:
     """One box a vehicle from N boxes, ``camera_index`` (N,) saying which of the ``cameras`` lifted each.
 
-    Score: 1 - prod(1 - s) over the cameras that contributed (false alarms of different cameras rarely coincide), times
-    ``single_view_factor`` where cameras that should see the vehicle are silent.
+    Score: 1 - prod(1 - s) over the cameras that contributed (false alarms of different cameras rarely coincide); then each
+    camera that should see the vehicle and is silent multiplies the odds by ``silence_ratio``.
     """
     settings = settings or FusionSettings()
     if len(boxes) == 0:
@@ -78,7 +77,7 @@ def fuse(boxes: Boxes, camera_index: Index, cameras: Sequence[Camera], settings:
     error = _calibration_covariance(single, owner, cameras, settings)
     cluster = _cluster(single, owner, error, settings)
     fused, members, cluster = _fuse_and_merge(single, owner, error, cluster, len(cameras), settings)
-    score = fused.score * _agreement(fused, members, cameras, settings)
+    score = _discounted(fused.score, _silences(fused, members, cameras, settings), settings.silence_ratio)
     order = np.argsort(-score, kind="stable")
     rank = np.argsort(order)
     position = np.zeros(len(boxes), np.int64)
@@ -89,18 +88,19 @@ def fuse(boxes: Boxes, camera_index: Index, cameras: Sequence[Camera], settings:
 
 def _calibration_covariance(boxes: Boxes, owner: Index, cameras: Sequence[Camera], settings: FusionSettings) -> Array:
     """Covariances (N, 7, 7) to add to the boxes for what calibration leaves open; height rests on the ground plane."""
-    origin = np.stack([camera.position_m for camera in cameras])[owner]
-    distance = np.linalg.norm(boxes.center[:, :2] - origin[:, :2], axis=1)
+    origin = np.stack([camera.position_m[:2] for camera in cameras])
+    offset = boxes.center[:, :2] - origin[owner]
     error = np.zeros((len(boxes), STATE_DIM, STATE_DIM))
     error[:, 2, 2] = settings.calibration_sigma_m**2
-    error[:, 0, 0] = error[:, 1, 1] = error[:, 2, 2] + (settings.calibration_sigma_rad * distance) ** 2
+    error[:, 0, 0] = error[:, 1, 1] = error[:, 2, 2] + settings.calibration_sigma_rad**2 * (offset * offset).sum(1)
     return error
 
 
 def _cluster(boxes: Boxes, owner: Index, error: Array, settings: FusionSettings) -> Index:
     """Cluster numbers (N,), 0 and up. The camera with most confidence starts; the others join one after another."""
-    xy = boxes.center[:, :2]
-    covariance = (boxes.covariance + error)[:, :2, :2]
+    # Relative to one box: world coordinates may be large, and information times them would round.
+    xy = boxes.center[:, :2] - boxes.center[0, :2]
+    covariance = boxes.covariance[:, :2, :2] + error[:, :2, :2]
     information = np.linalg.inv(covariance)
     weighted = (information @ xy[..., None])[..., 0]
     total = np.bincount(owner, weights=boxes.score)
@@ -109,11 +109,12 @@ def _cluster(boxes: Boxes, owner: Index, error: Array, settings: FusionSettings)
     sum_information, sum_weighted = np.zeros_like(information), np.zeros_like(weighted)
     for camera in np.argsort(-total, kind="stable"):
         mine = np.flatnonzero(owner == camera)
-        known = np.linalg.inv(sum_information[:count])
-        known_xy = (known @ sum_weighted[:count, :, None])[..., 0]
-        distance_sq, cost, distance_m = mahalanobis_cost(xy[mine], covariance[mine], known_xy, known)
-        rows, columns = gated_assignment(distance_sq, cost, distance_m, settings.gate, settings.max_distance_m)
-        cluster[mine[rows]] = columns
+        if count and len(mine):
+            known = np.linalg.inv(sum_information[:count])
+            known_xy = (known @ sum_weighted[:count, :, None])[..., 0]
+            distance_sq, cost, distance_m = mahalanobis_cost(xy[mine], covariance[mine], known_xy, known)
+            rows, columns = gated_assignment(distance_sq, cost, distance_m, settings.gate, settings.max_distance_m)
+            cluster[mine[rows]] = columns
         new = mine[cluster[mine] < 0]
         cluster[new] = count + np.arange(len(new))
         count += len(new)
@@ -196,17 +197,18 @@ def _voted_class(boxes: Boxes, cluster: Index, rows: int) -> Index:
     return winner
 
 
-def _agreement(fused: Boxes, members: NDArray[np.bool_], cameras: Sequence[Camera], settings: FusionSettings) -> Array:
-    """Score factors (M,): below 1 where one camera alone reports what several others have in full view."""
-    expected = np.zeros_like(members)
-    for index, camera in enumerate(cameras):
-        extents, in_front = project_extents(camera, fused.center, fused.dims_lwh, fused.yaw)
-        inside = (extents[:, :2] >= 0).all(1) & (extents[:, 2:] <= [camera.width - 1, camera.height - 1]).all(1)
-        near = np.linalg.norm(fused.center - camera.position_m, axis=1) <= settings.view_range_m
-        expected[:, index] = in_front & inside & near
-    silent = (expected & ~members).sum(1)
-    alone = (members.sum(1) == 1) & (silent >= settings.silent_views)
-    return np.where(alone, settings.single_view_factor, 1.0)
+def _silences(fused: Boxes, members: NDArray[np.bool_], cameras: Sequence[Camera], settings: FusionSettings) -> Array:
+    """Cameras (M,) that have each box in full view, within range, and do not report it."""
+    silent = whole_in_view(fused, cameras, settings.view_range_m) & ~members
+    count: Array = silent.sum(1).astype(np.float64)
+    return count
+
+
+def _discounted(score: Array, silences: Array, ratio: float) -> Array:
+    """Scores (M,) after ``silences`` (M,) likelihood ratios of ``ratio`` each: odds times ratio^silences."""
+    kept = score * ratio**silences
+    discounted: Array = kept / (kept + 1.0 - score)
+    return discounted
 
 
 def _with_score(boxes: Boxes, score: Array) -> Boxes:

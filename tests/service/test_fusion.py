@@ -16,7 +16,7 @@ from service.lifting import Measurements, lift
 
 K = np.array([[642.0, 0.0, 641.5], [0.0, 642.0, 191.5], [0.0, 0.0, 1.0]])
 SIGMA_DIMS = np.array([0.2, 0.06, 0.06])
-ANYWHERE = FusionSettings(single_view_factor=1.0)
+ANYWHERE = FusionSettings(silence_ratio=1.0)
 
 
 def four_cameras(rng=None, error_deg=0.0):
@@ -213,10 +213,13 @@ def test_overlapping_vehicles_become_one_though_the_gate_kept_them_apart():
 
 def test_what_others_should_see_and_do_not_is_less_certain():
     cameras = four_cameras()
-    alone = fuse(some_boxes([car()]), np.array([0]), cameras)
-    np.testing.assert_allclose(alone.boxes.score, 0.8 * 0.85)
-    np.testing.assert_allclose(fuse(some_boxes([car()]), np.array([0]), cameras[:2]).boxes.score, 0.8)
-    np.testing.assert_allclose(fuse(some_boxes([car()] * 2), np.arange(2), cameras).boxes.score, 1 - 0.2**2)
+    odds = np.array([fuse(some_boxes([car()] * n), np.arange(n), cameras).boxes.score[0] for n in range(1, 5)])
+    odds /= 1 - odds
+    expected = 1 - 0.2 ** np.arange(1, 5)
+    np.testing.assert_allclose(odds, expected / (1 - expected) * 0.8 ** np.arange(3, -1, -1))
+    fewer = [fuse(some_boxes([car()]), np.array([0]), cameras[:n]).boxes.score[0] for n in range(1, 5)]
+    assert (np.diff(fewer) < 0).all()
+    np.testing.assert_allclose(fewer[0], 0.8)
     far_away = some_boxes([car(-60.0, -60.0)])
     np.testing.assert_allclose(fuse(far_away, np.array([0]), cameras).boxes.score, 0.8)
 
