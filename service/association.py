@@ -5,12 +5,23 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
 
 from service.geometry.boxes import Boxes
 from service.geometry.iou import clip_convex_pairs, rectangle_corners
 from service.geometry.transforms import Array
 
 Index = NDArray[np.int64]
+
+
+def inverse_2x2(matrices: Array) -> Array:
+    """Inverses of symmetric, positive definite matrices (N, 2, 2); in closed form, several times quicker than LAPACK's."""
+    xx, xy, yy = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
+    inverse = np.empty_like(matrices)
+    scale = 1.0 / (xx * yy - xy * xy)
+    inverse[:, 0, 0], inverse[:, 1, 1] = yy * scale, xx * scale
+    inverse[:, 0, 1] = inverse[:, 1, 0] = -xy * scale
+    return inverse
 
 
 def mahalanobis_cost(a_xy: Array, a_cov: Array, b_xy: Array, b_cov: Array) -> tuple[Array, Array, Array]:
@@ -82,15 +93,17 @@ def _same_vehicle(boxes: Boxes, group: Index, iou: float, distance_m: float) -> 
     """Pairs of rows, each pair once, of boxes of a group that are the same vehicle."""
     xy, lw = boxes.center[:, :2], boxes.dims_lwh[:, :2]
     reach = np.maximum(0.5 * np.hypot(lw[:, 0], lw[:, 1]), 0.5 * distance_m)
-    dx, dy = xy[:, None, 0] - xy[:, 0], xy[:, None, 1] - xy[:, 1]
-    near = dx * dx + dy * dy < (reach[:, None] + reach) ** 2
-    near &= group[:, None] == group
-    first, second = np.nonzero(near)
-    once = first < second
-    first, second = first[once], second[once]
-    if len(first) == 0:
-        return first, second
-    close = np.hypot(dx[first, second], dy[first, second]) < distance_m
+    largest = 2.0 * float(reach.max()) if len(reach) else 0.0
+    # Groups lie apart on a third axis, so that the tree pairs within groups only.
+    points = np.empty((len(boxes), 3))
+    points[:, :2], points[:, 2] = xy, group * (2.0 * largest + 1.0)
+    first, second = cKDTree(points).query_pairs(largest, output_type="ndarray").T if len(boxes) else np.zeros((2, 0), np.int64)
+    apart = np.hypot(xy[first, 0] - xy[second, 0], xy[first, 1] - xy[second, 1])
+    near = apart < reach[first] + reach[second]
+    if not near.any():
+        return first[:0], second[:0]
+    first, second = first[near], second[near]
+    close = apart[near] < distance_m
     area = lw[:, 0] * lw[:, 1]
     total = area[first] + area[second]
     # Clipping polygons is dear: it is left to the pairs that neither distance nor a bound on the shared area settles.

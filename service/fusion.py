@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.association import Index, best_of_duplicates, gated_assignment, mahalanobis_cost
+from service.association import Index, best_of_duplicates, gated_assignment, inverse_2x2, mahalanobis_cost
 from service.geometry.boxes import STATE_DIM, Boxes, box_states
 from service.geometry.camera import Camera
 from service.geometry.transforms import Array, wrap_angle
@@ -101,7 +101,7 @@ def _cluster(boxes: Boxes, owner: Index, error: Array, settings: FusionSettings)
     # Relative to one box: world coordinates may be large, and information times them would round.
     xy = boxes.center[:, :2] - boxes.center[0, :2]
     covariance = boxes.covariance[:, :2, :2] + error[:, :2, :2]
-    information = np.linalg.inv(covariance)
+    information = inverse_2x2(covariance)
     weighted = (information @ xy[..., None])[..., 0]
     total = np.bincount(owner, weights=boxes.score)
     cluster = np.full(len(boxes), -1, np.int64)
@@ -110,7 +110,7 @@ def _cluster(boxes: Boxes, owner: Index, error: Array, settings: FusionSettings)
     for camera in np.argsort(-total, kind="stable"):
         mine = np.flatnonzero(owner == camera)
         if count and len(mine):
-            known = np.linalg.inv(sum_information[:count])
+            known = inverse_2x2(sum_information[:count])
             known_xy = (known @ sum_weighted[:count, :, None])[..., 0]
             distance_sq, cost, distance_m = mahalanobis_cost(xy[mine], covariance[mine], known_xy, known)
             rows, columns = gated_assignment(distance_sq, cost, distance_m, settings.gate, settings.max_distance_m)
@@ -165,10 +165,10 @@ def _combine(boxes: Boxes, error: Array, cluster: Index) -> Boxes:
     reference = np.zeros((rows, STATE_DIM))
     reference[cluster[::-1], :3] = state[::-1, :3]
     state -= reference[cluster]
-    sum_information = np.zeros((rows, STATE_DIM, STATE_DIM))
-    sum_weighted = np.zeros((rows, STATE_DIM))
-    np.add.at(sum_information, cluster, information)
-    np.add.at(sum_weighted, cluster, (information @ state[..., None])[..., 0])
+    # One product adds up the clusters, several times quicker than ``np.add.at``.
+    belongs = (np.arange(rows)[:, None] == cluster).astype(np.float64)
+    sum_information = (belongs @ information.reshape(-1, STATE_DIM**2)).reshape(rows, STATE_DIM, STATE_DIM)
+    sum_weighted = belongs @ (information @ state[..., None])[..., 0]
     fused_covariance = np.linalg.inv(sum_information)
     fused = (fused_covariance @ sum_weighted[..., None])[..., 0] + reference
     return Boxes(
@@ -191,8 +191,8 @@ def _circular_axis(yaw: Array, weight: Array, cluster: Index, rows: int) -> Arra
 
 
 def _voted_class(boxes: Boxes, cluster: Index, rows: int) -> Index:
-    votes = np.zeros((rows, int(boxes.cls.max()) + 1))
-    np.add.at(votes, (cluster, boxes.cls), boxes.score)
+    classes = int(boxes.cls.max()) + 1
+    votes = np.bincount(cluster * classes + boxes.cls, boxes.score, rows * classes).reshape(rows, classes)
     winner: Index = votes.argmax(1).astype(np.int64)
     return winner
 
