@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from service.geometry.boxes import CORNER_SIGNS, STATE_DIM
 from service.geometry.camera import MIN_DEPTH_M
+from service.geometry.ground import Ground
 from service.geometry.transforms import Array, wrap_angle
 
 EDGES, GROUND, DEPTH = slice(0, 4), 4, 5
@@ -43,10 +44,8 @@ class BoxProblem:
     """(N, 7) start position, predicted size, predicted yaw."""
     prior_weight: Array
     """(N, 7) 1 / sigma of the prior."""
-    ground_normal: Array
-    """(3,) unit normal of the ground plane, world."""
-    ground_offset: float
-    """Offset of the ground plane, metres."""
+    ground: Ground
+    """The road, world."""
     ground_weight: Array
     """(N,) 1 / sigma, 1/m."""
     ray: Array
@@ -138,12 +137,13 @@ def _edge_rows(problem: BoxProblem, state: Array, axes: Array, residual: Array, 
 
 
 def _ground_row(problem: BoxProblem, state: Array, residual: Array, jacobian: Array) -> None:
-    """Centre of the bottom face on the ground plane."""
-    normal = problem.ground_normal
-    gap = state[:, :3] @ normal - 0.5 * normal[2] * state[:, 5] - problem.ground_offset
-    residual[:, GROUND] = gap * problem.ground_weight
-    jacobian[:, GROUND, :3] = normal * problem.ground_weight[:, None]
-    jacobian[:, GROUND, 5] = -0.5 * normal[2] * problem.ground_weight
+    """Centre of the bottom face on the ground, or on its tangent plane below the box where the ground is a grid."""
+    normal, offset = problem.ground.tangent_at(state[:, :2])
+    weight = problem.ground_weight
+    gap = (state[:, :3] * normal).sum(1) - 0.5 * normal[..., 2] * state[:, 5] - offset
+    residual[:, GROUND] = gap * weight
+    jacobian[:, GROUND, :3] = normal * weight[:, None]
+    jacobian[:, GROUND, 5] = -0.5 * normal[..., 2] * weight
 
 
 def _depth_row(problem: BoxProblem, state: Array, axes: Array, residual: Array, jacobian: Array) -> None:
