@@ -27,6 +27,26 @@ _DIMS = slice(3, 6)
 
 
 @dataclass(frozen=True, eq=False)
+class CameraParts:
+    """What the cameras contributed to M fused boxes: K boxes, one a camera and vehicle."""
+
+    boxes: Boxes
+    """K boxes; their covariances include what calibration leaves open, and the shared part of the size's error."""
+    row: Index
+    """(K,) the fused box that each went into."""
+    camera: Index
+    """(K,) the camera that each came from."""
+    captured_at_ns: Index | None = None
+    """(K,) when, nanoseconds since 1970 (UTC); None: all at the set's time."""
+
+    def of_rows(self, keep: NDArray[np.bool_]) -> CameraParts:
+        """The parts of the fused boxes that a mask (M,) keeps, under the rows that these then have."""
+        mine = keep[self.row]
+        times = None if self.captured_at_ns is None else self.captured_at_ns[mine]
+        return CameraParts(self.boxes.take(mine), (np.cumsum(keep) - 1)[self.row[mine]], self.camera[mine], times)
+
+
+@dataclass(frozen=True, eq=False)
 class FusedBoxes:
     """M vehicles out of N boxes of C cameras."""
 
@@ -36,6 +56,8 @@ class FusedBoxes:
     """(M, C) which cameras contributed."""
     source: Index
     """(N,) the row of ``boxes`` that each input box went into (duplicates: the row of the one that was kept)."""
+    parts: CameraParts | None = None
+    """The cameras' own measurements, for the tracker; None where they are not known."""
 
 
 @dataclass(frozen=True)
@@ -76,14 +98,17 @@ def fuse(boxes: Boxes, camera_index: Index, cameras: Sequence[Camera], settings:
     single, owner = boxes.take(kept), camera_index[kept]
     error = _calibration_covariance(single, owner, cameras, settings)
     cluster = _cluster(single, owner, error, settings)
-    fused, members, cluster = _fuse_and_merge(single, owner, error, cluster, len(cameras), settings)
+    fused, parts, cluster = _fuse_and_merge(single, owner, error, cluster, settings)
+    members = np.zeros((len(fused), len(cameras)), dtype=bool)
+    members[parts.row, parts.camera] = True
     score = _discounted(fused.score, _silences(fused, members, cameras, settings), settings.silence_ratio)
     order = np.argsort(-score, kind="stable")
     rank = np.argsort(order)
     position = np.zeros(len(boxes), np.int64)
     position[kept] = np.arange(len(kept))
     ranked = _with_score(fused, score).take(order)
-    return FusedBoxes(ranked, members[order], rank[cluster][position[keeper]])
+    parts = CameraParts(parts.boxes, rank[parts.row], parts.camera)
+    return FusedBoxes(ranked, members[order], rank[cluster][position[keeper]], parts)
 
 
 def _calibration_covariance(boxes: Boxes, owner: Index, cameras: Sequence[Camera], settings: FusionSettings) -> Array:
@@ -124,19 +149,18 @@ def _cluster(boxes: Boxes, owner: Index, error: Array, settings: FusionSettings)
 
 
 def _fuse_and_merge(
-    boxes: Boxes, owner: Index, error: Array, cluster: Index, cameras: int, settings: FusionSettings
-) -> tuple[Boxes, NDArray[np.bool_], Index]:
-    """Fused boxes, members (M, C) and clusters (N,); clusters that turn out to be one vehicle become one."""
+    boxes: Boxes, owner: Index, error: Array, cluster: Index, settings: FusionSettings
+) -> tuple[Boxes, CameraParts, Index]:
+    """Fused boxes, their parts and clusters (N,); clusters that turn out to be one vehicle become one."""
     while True:
         used = _best_per_camera(boxes, owner, cluster)
-        fused = _combine(boxes.take(used), error[used], cluster[used])
+        parts = _parts(boxes.take(used), error[used], cluster[used])
+        fused = _combine(parts, cluster[used])
         everyone = np.zeros(len(fused), np.int64)
         keeper = best_of_duplicates(fused, everyone, settings.duplicate_iou, settings.duplicate_distance_m)
         survivors, renumbered = np.unique(keeper, return_inverse=True)
         if len(survivors) == len(fused):
-            members = np.zeros((len(fused), cameras), dtype=bool)
-            members[cluster[used], owner[used]] = True
-            return fused, members, cluster
+            return fused, CameraParts(parts, cluster[used], owner[used]), cluster
         cluster = renumbered[cluster].astype(np.int64)
 
 
@@ -149,14 +173,19 @@ def _best_per_camera(boxes: Boxes, owner: Index, cluster: Index) -> Index:
     return np.sort(order[first])
 
 
-def _combine(boxes: Boxes, error: Array, cluster: Index) -> Boxes:
-    """One box a cluster (numbered 0 .. M-1 without gaps) by information, size as in covariance intersection."""
-    count = np.bincount(cluster)
-    rows = len(count)
+def _parts(boxes: Boxes, error: Array, cluster: Index) -> Boxes:
+    """The boxes with covariances that may be added up as information: size n-fold, as n cameras share its error."""
     covariance = boxes.covariance + error
-    covariance[:, _DIMS, _DIMS] += (count[cluster] - 1.0)[:, None, None] * boxes.covariance[:, _DIMS, _DIMS]
-    information = np.linalg.inv(covariance)
-    axis = _circular_axis(boxes.yaw, 1.0 / covariance[:, 6, 6], cluster, rows)
+    others = np.bincount(cluster)[cluster] - 1.0
+    covariance[:, _DIMS, _DIMS] += others[:, None, None] * boxes.covariance[:, _DIMS, _DIMS]
+    return Boxes(boxes.center, boxes.dims_lwh, boxes.yaw, boxes.score, boxes.cls, covariance, boxes.flip_log_odds)
+
+
+def _combine(boxes: Boxes, cluster: Index) -> Boxes:
+    """One box a cluster (numbered 0 .. M-1 without gaps) by information."""
+    rows = int(cluster.max()) + 1
+    information = np.linalg.inv(boxes.covariance)
+    axis = _circular_axis(boxes.yaw, 1.0 / boxes.covariance[:, 6, 6], cluster, rows)
     aligned = np.cos(boxes.yaw - axis[cluster]) >= 0
     evidence = np.bincount(cluster, np.where(aligned, 1.0, -1.0) * boxes.flip_log_odds, rows)
     state = box_states(boxes)

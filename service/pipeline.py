@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import cv2
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from service.depth_scale import DepthReadings, DepthScales, read_boxes
 from service.errors import FrameError
 from service.frames import FrameSet, decode
-from service.fusion import FusedBoxes, FusionSettings, fuse
+from service.fusion import CameraParts, FusedBoxes, FusionSettings, fuse
 from service.geometry.boxes import Boxes, clip_extents, cut_edges
 from service.geometry.camera import Camera, UInt8Image, yaw_from_alpha
 from service.lifting import LiftSettings, Measurements, lift
@@ -26,6 +26,9 @@ from service.nets.multibin import Multibin, MultibinEstimates, crop_vehicles
 from service.nets.pack import Pack
 from service.paper_fusion import PaperFusionSettings, fuse_paper
 from service.site import Site
+
+_UNKNOWN_YAW_SIGMA = np.pi / np.sqrt(3.0)
+"""Standard deviation of an angle that may be any, radians."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,8 @@ class SetResult:
     """Wall time of each step."""
     failed: dict[str, FrameError]
     """Cameras whose frame could not be decoded."""
+    parts: CameraParts | None = None
+    """What each camera contributed to ``boxes``, and when, for the tracker; cameras as in ``camera_ids``."""
 
 
 class Pipeline:
@@ -121,6 +126,7 @@ class Pipeline:
             detections={camera.id: len(detections) for camera, detections in zip(cameras, found, strict=True)},
             timing_ms=timing,
             failed=failed,
+            parts=None if fused.parts is None else _timed_parts(fused.parts.of_rows(keep), frame_set, cameras),
         )
 
     def _lift(self, cameras: list[Camera], site: Site, measurements: Measurements) -> Boxes:
@@ -177,9 +183,12 @@ class Pipeline:
         xyxy = np.concatenate([clip_extents(camera, d.xyxy_px) for camera, d in zip(cameras, found, strict=True)])
         centers = (xyxy[:, :2] + xyxy[:, 2:]) / 2
         yaw, is_cut = np.zeros(len(index)), np.zeros(len(index), dtype=bool)
+        # A quantised network can give a heading vector of length zero, whose angle is not a number.
+        headed = np.isfinite(estimates.alpha)
+        alpha = np.where(headed, estimates.alpha, 0.0)
         for row, camera in enumerate(cameras):
             own = index == row
-            yaw[own] = yaw_from_alpha(camera, estimates.alpha[own], centers[own])
+            yaw[own] = yaw_from_alpha(camera, alpha[own], centers[own])
             is_cut[own] = cut_edges(camera, xyxy[own]).any(1)
         spec = self.multibin.spec
         score = np.concatenate([d.score for d in found])
@@ -190,13 +199,20 @@ class Pipeline:
             dims_lwh=estimates.dims_lwh,
             sigma_dims=np.stack([model.sigma(score, is_cut) for model in spec.sigma_dims_lwh], 1),
             yaw=yaw,
-            sigma_yaw=spec.sigma_alpha_rad.sigma(score, is_cut),
-            flip_log_odds=estimates.flip_log_odds,
+            sigma_yaw=np.where(headed, spec.sigma_alpha_rad.sigma(score, is_cut), _UNKNOWN_YAW_SIGMA),
+            flip_log_odds=np.where(headed, estimates.flip_log_odds, 0.0),
             score=score,
             cls=np.concatenate([d.cls for d in found]),
             depth_m=readings.depth_m,
             sigma_depth_m=readings.sigma_m,
         )
+
+
+def _timed_parts(parts: CameraParts, frame_set: FrameSet, cameras: list[Camera]) -> CameraParts:
+    """The parts with their cameras' capture times; the set's time where a camera has none of its own."""
+    own = {frame.camera_id: frame.captured_at_ns for frame in frame_set.frames if frame.captured_at_ns is not None}
+    times = np.array([own.get(camera.id, frame_set.captured_at_ns) for camera in cameras], dtype=np.int64)
+    return replace(parts, captured_at_ns=times[parts.camera])
 
 
 @contextmanager
