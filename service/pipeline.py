@@ -45,7 +45,8 @@ class PipelineSettings:
     """Fused boxes of a lower score are dropped."""
     max_position_sigma_m: float = 1.2
     """Fused boxes whose place on the road is less certain (one sigma, both axes together) are dropped: mostly vehicles that one
-    camera alone sees, from far away, often beside their own box from the other cameras. ``per_camera`` has them."""
+    camera alone sees, from far away, often beside their own box from the other cameras. ``per_camera`` has them. The paper's
+    method knows no such limit."""
     lift: LiftSettings = field(default_factory=LiftSettings)
     fusion: FusionSettings = field(default_factory=FusionSettings)
     paper_fusion: PaperFusionSettings = field(default_factory=PaperFusionSettings)
@@ -143,8 +144,11 @@ class Pipeline:
         return fuse(lifted, camera_index, cameras, self.settings.fusion)
 
     def _reported(self, boxes: Boxes) -> NDArray[np.bool_]:
+        confident = boxes.score >= self.settings.min_fused_score
+        if self.settings.method == "paper":
+            return confident
         sigma = np.sqrt(boxes.covariance[:, 0, 0] + boxes.covariance[:, 1, 1])
-        return (boxes.score >= self.settings.min_fused_score) & (sigma <= self.settings.max_position_sigma_m)
+        return confident & (sigma <= self.settings.max_position_sigma_m)
 
     def _decode(self, frame_set: FrameSet) -> tuple[list[Camera], list[UInt8Image], dict[str, FrameError]]:
         """Images, and the cameras at the images' sizes."""
