@@ -68,7 +68,7 @@ def _lift_batch(cameras: Sequence[Camera], m: Measurements, rows: slice, setting
     equations[:, np.arange(4), _IMAGE_AXIS] = 1.0
     equations[..., 2] = -seen.edges
     visible = ~seen.hinged
-    inverse: Array = np.linalg.pinv(equations * visible[..., None], rcond=_RANK_TOLERANCE)
+    inverse = np.asarray(np.linalg.pinv(equations * visible[..., None], rcond=_RANK_TOLERANCE), dtype=np.float64)
     # One right-hand side an edge and corner; a translation is the sum of one of each edge.
     right = -np.einsum("nek,nck->nec", equations, corners)
     parts = inverse.transpose(0, 2, 1)[:, :, None] * (right * visible[..., None])[..., None]
