@@ -46,9 +46,11 @@ def gated_assignment(
     good match just to have a bad one itself.
     """
     allowed = (distance_sq < gate) & (distance_m < max_distance_m)
-    if not allowed.any():
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    rows, columns = np.nonzero(allowed)
     n, m = cost.shape
+    if len(rows) == 0 or max(np.bincount(rows).max(), np.bincount(columns).max()) == 1:
+        # Nobody has a choice, and every pair inside the gates is better than two alone.
+        return rows, columns
     alone = gate + float((cost - distance_sq)[allowed].max())
     table = np.full((n, m + n), alone)
     table[:, :m] = np.where(allowed, cost, alone + 1e6)
@@ -107,10 +109,9 @@ def _same_vehicle(boxes: Boxes, group: Index, iou: float, distance_m: float) -> 
     area = lw[:, 0] * lw[:, 1]
     total = area[first] + area[second]
     # Clipping polygons is dear: it is left to the pairs that neither distance nor a bound on the shared area settles.
-    open_ = np.flatnonzero(~close)
-    for a, b in ((first, second), (second, first)):
-        bound = _shared_bound(boxes, a[open_], b[open_])
-        open_ = open_[bound > iou * (total[open_] - bound)]
+    bounds = _shared_bound(boxes, np.concatenate([first, second]), np.concatenate([second, first]))
+    bound = np.minimum(bounds[: len(first)], bounds[len(first) :])
+    open_ = np.flatnonzero(~close & (bound > iou * (total - bound)))
     if len(open_):
         corners = rectangle_corners(xy, lw, boxes.yaw)
         shared = clip_convex_pairs(corners[first[open_]], corners[second[open_]])
