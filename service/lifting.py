@@ -24,6 +24,8 @@ _MIN_SIGMA_PX, _MIN_SIGMA_M, _MIN_SIGMA_RAD = 0.25, 0.01, 0.005
 _MAX_SIGMA_PX, _MAX_SIGMA_M, _MAX_SIGMA_RAD = 1e3, 30.0, np.pi
 _MIN_DEPTH_SIGMA_M, _MAX_DEPTH_M = 0.05, 1000.0
 _CONDITION_FLOOR = 1e-9
+_FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 1e-6, 1e6
+_DIAGONAL = np.arange(STATE_DIM)
 _MIN_START_DEPTH_M = 1.0
 _LENS_PASSES = 2
 _MAX_LENS_MISS = 0.1
@@ -82,8 +84,8 @@ class LiftSettings:
     """Starts farther than this (rays near the horizon) are taken from the size instead."""
     iterations: int = 6
     """Most solver steps; boxes that have converged stand still before that."""
-    step_tolerance: float = 0.05
-    """A box has converged when its step is below this share of its own sigmas."""
+    step_tolerance: float = 0.1
+    """A box has converged when its step is shorter than this, in its own sigmas (Mahalanobis)."""
 
 
 def lift(cameras: Sequence[Camera], ground: Ground, measurements: Measurements, settings: LiftSettings | None = None) -> Boxes:
@@ -265,32 +267,33 @@ def _start(ground: Ground, seen: EdgeMeasurements, settings: LiftSettings) -> tu
 
 
 def _solve(problem: BoxProblem, start: Array, settings: LiftSettings) -> tuple[Array, NormalEquations]:
-    """Damped Gauss-Newton on every box at once; each box has its own damping and stops by itself."""
-    state = start.copy()
-    now = normal_equations(problem, state)
-    damping = np.full(len(state), 1e-3)
-    moving = np.ones(len(state), dtype=bool)
-    diagonal = np.arange(STATE_DIM)
+    """Damped Gauss-Newton on every box at once; each box has its own damping, and leaves the batch when it has converged."""
+    state, now = start.copy(), normal_equations(problem, start)
+    total = now
+    rows = np.arange(len(start))
+    damping = np.full(len(start), _FIRST_DAMPING)
+    moving = state
     for _ in range(settings.iterations):
-        scale = now.hessian[:, diagonal, diagonal]
         damped = now.hessian.copy()
-        damped[:, diagonal, diagonal] += damping[:, None] * scale
+        damped[:, _DIAGONAL, _DIAGONAL] *= 1.0 + damping[:, None]
         step = np.linalg.solve(damped, -now.gradient[..., None])[..., 0]
-        trial = state + step
-        trial[:, 3:6] = np.clip(trial[:, 3:6], _MIN_DIM_M, _MAX_DIM_M)
+        trial = moving + step
+        np.minimum(np.maximum(trial[:, 3:6], _MIN_DIM_M), _MAX_DIM_M, out=trial[:, 3:6])
         then = normal_equations(problem, trial)
-        better = moving & (then.cost <= now.cost)
-        state = np.where(better[:, None], trial, state)
-        now = NormalEquations(
-            np.where(better, then.cost, now.cost),
-            np.where(better[:, None], then.gradient, now.gradient),
-            np.where(better[:, None, None], then.hessian, now.hessian),
-        )
-        damping = np.clip(np.where(better, 0.2 * damping, 10.0 * damping), 1e-6, 1e6)
-        moving &= ~(better & (np.abs(step) * np.sqrt(scale) < settings.step_tolerance).all(1))
-        if not moving.any():
+        better = then.cost <= now.cost
+        # Twice what the quadratic model promises: the step's squared length in the box's own sigmas.
+        going = -(now.gradient * step).sum(1) > settings.step_tolerance**2
+        mine = rows[better]
+        state[mine] = trial[better]
+        for kept, new in zip(total, then, strict=True):
+            kept[mine] = new[better]
+        if not going.any():
             break
-    return state, now
+        rows, damping = rows[going], np.where(better, 0.2 * damping, 10.0 * damping)[going]
+        np.minimum(np.maximum(damping, _MIN_DAMPING), _MAX_DAMPING, out=damping)
+        problem = problem if going.all() else problem.take(going)
+        moving, now = state[rows], NormalEquations(*(kept[rows] for kept in total))
+    return state, total
 
 
 def _covariance(hessian: Array) -> Array:

@@ -6,7 +6,8 @@ undistorted normalised coordinates (x/z, y/z); distances there are pixels over t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,10 @@ EDGES, GROUND, DEPTH = slice(0, 4), 4, 5
 ROWS = 6
 _EDGE_AXIS = np.array([0, 1, 0, 1])
 _FAR_PARALLEL = 1e-9
+_PER_BOX = (
+    *("R", "t", "origin", "edges", "edge_weight", "hinged", "prior", "prior_weight"),
+    *("ground_weight", "ray", "depth", "depth_weight"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +62,12 @@ class BoxProblem:
     huber: Array
     """(6,) residual (sigmas) from which a row counts linearly."""
 
+    def take(self, index: NDArray[np.bool_]) -> BoxProblem:
+        """The boxes at a mask (N,)."""
+        return replace(self, **{name: getattr(self, name)[index] for name in _PER_BOX})
 
-@dataclass(frozen=True, eq=False)
-class NormalEquations:
+
+class NormalEquations(NamedTuple):
     """Cost (N,), gradient (N, 7) and Gauss-Newton Hessian (N, 7, 7) of N boxes."""
 
     cost: Array
