@@ -152,16 +152,25 @@ def _fuse_and_merge(
     boxes: Boxes, owner: Index, error: Array, cluster: Index, settings: FusionSettings
 ) -> tuple[Boxes, CameraParts, Index]:
     """Fused boxes, their parts and clusters (N,); clusters that turn out to be one vehicle become one."""
+    used = _best_per_camera(boxes, owner, cluster)
+    parts = _parts(boxes.take(used), error[used], cluster[used])
+    fused = _combine(parts, cluster[used])
     while True:
-        used = _best_per_camera(boxes, owner, cluster)
-        parts = _parts(boxes.take(used), error[used], cluster[used])
-        fused = _combine(parts, cluster[used])
         everyone = np.zeros(len(fused), np.int64)
         keeper = best_of_duplicates(fused, everyone, settings.duplicate_iou, settings.duplicate_distance_m)
         survivors, renumbered = np.unique(keeper, return_inverse=True)
         if len(survivors) == len(fused):
             return fused, CameraParts(parts, cluster[used], owner[used]), cluster
         cluster = renumbered[cluster].astype(np.int64)
+        used = _best_per_camera(boxes, owner, cluster)
+        parts = _parts(boxes.take(used), error[used], cluster[used])
+        # Only what has changed is combined again: the inverses are the dearest step.
+        changed = np.flatnonzero(np.bincount(renumbered) > 1)
+        mine = np.isin(cluster[used], changed)
+        again = _combine(parts.take(mine), np.searchsorted(changed, cluster[used][mine]))
+        row = np.arange(len(survivors))
+        row[changed] = len(survivors) + np.arange(len(changed))
+        fused = Boxes.concatenate([fused.take(survivors), again]).take(row)
 
 
 def _best_per_camera(boxes: Boxes, owner: Index, cluster: Index) -> Index:
