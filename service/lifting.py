@@ -151,12 +151,12 @@ def edge_measurements(cameras: Sequence[Camera], m: Measurements, rows: slice, s
     index = m.camera_index[rows]
     border = np.array([[camera.width - 1.0, camera.height - 1.0] for camera in cameras])[index]
     xyxy = m.xyxy_px[rows]
-    first, second = np.clip(xyxy[:, :2], 0.0, border), np.clip(xyxy[:, 2:], 0.0, border)
-    low, high = np.minimum(first, second), np.maximum(first, second)
+    low, high = np.minimum(xyxy[:, :2], xyxy[:, 2:]), np.maximum(xyxy[:, :2], xyxy[:, 2:])
+    low, high = (np.minimum(np.maximum(end, 0.0), border) for end in (low, high))
     visible = np.concatenate([low, high], 1)
     T = np.stack([camera.T_cam_world for camera in cameras])[index]
-    focal = np.stack([camera.K[[0, 1, 0, 1], [0, 1, 0, 1]] for camera in cameras])[index]
-    points = _normalised(cameras, index, _middles(visible))
+    K = np.stack([camera.K for camera in cameras])[index]
+    points = _normalised(cameras, index, K, _middles(visible))
     rays = np.concatenate([points[:, 3:], np.ones_like(points[:, 3:, :1])], -1) @ T[:, :3, :3]
     return EdgeMeasurements(
         R=T[:, :3, :3],
@@ -165,7 +165,7 @@ def edge_measurements(cameras: Sequence[Camera], m: Measurements, rows: slice, s
         xyxy_px=visible,
         hinged=np.concatenate([low <= settings.border_px, high >= border - settings.border_px], 1),
         edges=np.stack([points[:, 0, 0], points[:, 1, 1], points[:, 2, 0], points[:, 3, 1]], 1),
-        edge_weight=focal / np.clip(m.sigma_px[rows], _MIN_SIGMA_PX, _MAX_SIGMA_PX),
+        edge_weight=K[:, [0, 1, 0, 1], [0, 1, 0, 1]] / np.clip(m.sigma_px[rows], _MIN_SIGMA_PX, _MAX_SIGMA_PX),
         bottom_ray=rays[:, 0],
         center_ray=rays[:, 1],
         dims_lwh=np.clip(m.dims_lwh[rows], _MIN_DIM_M, _MAX_DIM_M),
@@ -211,17 +211,21 @@ def _depth_readings(m: Measurements) -> tuple[Array, Array]:
 
 def _middles(xyxy: Array) -> Array:
     """Middles of the left, top, right and bottom edges and the centre (N, 5, 2) of 2D boxes (N, 4), px."""
-    left, top, right, bottom = xyxy.T
-    x, y = 0.5 * (left + right), 0.5 * (top + bottom)
-    return np.stack([np.stack(p, -1) for p in ((left, y), (x, top), (right, y), (x, bottom), (x, y))], 1)
+    middle = 0.5 * (xyxy[:, :2] + xyxy[:, 2:])
+    points = np.repeat(middle[:, None], 5, axis=1)
+    points[:, [0, 1, 2, 3], [0, 1, 0, 1]] = xyxy
+    return points
 
 
-def _normalised(cameras: Sequence[Camera], index: NDArray[np.int64], pixels: Array) -> Array:
-    """Undistorted normalised points of pixels (N, P, 2) in the cameras ``index`` (N,)."""
+def _normalised(cameras: Sequence[Camera], index: NDArray[np.int64], K: Array, pixels: Array) -> Array:
+    """Undistorted normalised points of pixels (N, P, 2) in the cameras ``index`` (N,), whose matrices are K (N, 3, 3)."""
     points = np.empty_like(pixels)
-    for number in np.unique(index):
-        mine = index == number
-        points[mine] = cameras[number].normalised_from_pixels(pixels[mine])
+    points[..., 1] = (pixels[..., 1] - K[:, 1, 2, None]) / K[:, 1, 1, None]
+    points[..., 0] = (pixels[..., 0] - K[:, 0, 2, None] - K[:, 0, 1, None] * points[..., 1]) / K[:, 0, 0, None]
+    for number, camera in enumerate(cameras):
+        if camera.has_distortion:
+            mine = index == number
+            points[mine] = camera.normalised_from_pixels(pixels[mine])
     return points
 
 
@@ -283,17 +287,28 @@ def _solve(problem: BoxProblem, start: Array, settings: LiftSettings) -> tuple[A
         better = then.cost <= now.cost
         # Twice what the quadratic model promises: the step's squared length in the box's own sigmas.
         going = -(now.gradient * step).sum(1) > settings.step_tolerance**2
-        mine = rows[better]
-        state[mine] = trial[better]
-        for kept, new in zip(total, then, strict=True):
-            kept[mine] = new[better]
+        if not better.all():
+            trial, then = np.where(better[:, None], trial, moving), _chosen(better, then, now)
+        if len(rows) == len(start):
+            state, total = trial, then
+        else:
+            state[rows] = trial
+            for kept, new in zip(total, then, strict=True):
+                kept[rows] = new
         if not going.any():
             break
-        rows, damping = rows[going], np.where(better, 0.2 * damping, 10.0 * damping)[going]
-        np.minimum(np.maximum(damping, _MIN_DAMPING), _MAX_DAMPING, out=damping)
-        problem = problem if going.all() else problem.take(going)
-        moving, now = state[rows], NormalEquations(*(kept[rows] for kept in total))
+        damping = np.minimum(np.maximum(damping * np.where(better, 0.2, 10.0), _MIN_DAMPING), _MAX_DAMPING)
+        moving, now = trial, then
+        if not going.all():
+            rows, damping, moving, problem = rows[going], damping[going], trial[going], problem.take(going)
+            now = NormalEquations(*(kept[going] for kept in then))
     return state, total
+
+
+def _chosen(better: NDArray[np.bool_], then: NormalEquations, now: NormalEquations) -> NormalEquations:
+    """``then`` where the step was better (N,), else ``now``."""
+    pick = [better.reshape(-1, *(1,) * (new.ndim - 1)) for new in then]
+    return NormalEquations(*(np.where(p, new, old) for p, new, old in zip(pick, then, now, strict=True)))
 
 
 def _covariance(hessian: Array) -> Array:

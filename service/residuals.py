@@ -23,6 +23,8 @@ EDGES, GROUND, DEPTH = slice(0, 4), 4, 5
 ROWS = 6
 _EDGE_AXIS = np.array([0, 1, 0, 1])
 _FAR_PARALLEL = 1e-9
+_TINY = 1e-30
+_DIAGONAL = np.arange(STATE_DIM)
 _PER_BOX = (
     *("R", "t", "origin", "edges", "edge_weight", "hinged", "prior", "prior_weight"),
     *("ground_weight", "ray", "depth", "depth_weight"),
@@ -90,14 +92,14 @@ def normal_equations(problem: BoxProblem, state: Array) -> NormalEquations:
     residual, jacobian = residuals(problem, state)
     magnitude = np.abs(residual)
     inner = np.minimum(magnitude, problem.huber)
-    robust = np.divide(inner, magnitude, out=np.ones_like(inner), where=magnitude > 0)
+    robust = np.maximum(inner, _TINY) / np.maximum(magnitude, _TINY)
     offset = state - problem.prior
     offset[:, 6] = wrap_angle(offset[:, 6])
-    pull = offset * problem.prior_weight**2
+    information = problem.prior_weight * problem.prior_weight
+    pull = offset * information
     weighted_t = (jacobian * robust[..., None]).transpose(0, 2, 1)
     hessian = weighted_t @ jacobian
-    diagonal = np.arange(STATE_DIM)
-    hessian[:, diagonal, diagonal] += problem.prior_weight**2
+    hessian[:, _DIAGONAL, _DIAGONAL] += information
     gradient = (weighted_t @ residual[..., None])[..., 0] + pull
     cost = (inner * (magnitude - 0.5 * inner)).sum(1) + 0.5 * (offset * pull).sum(1)
     return NormalEquations(cost, gradient, hessian)
