@@ -24,6 +24,9 @@ ROWS = 6
 _EDGE_AXIS = np.array([0, 1, 0, 1])
 _FAR_PARALLEL = 1e-9
 _TINY = 1e-30
+_SIGNS_T = np.ascontiguousarray(CORNER_SIGNS.T)
+_HALF_SIGNS = 0.5 * CORNER_SIGNS
+_OUTWARD = np.array([-1.0, -1.0, 1.0, 1.0])
 _DIAGONAL = np.arange(STATE_DIM)
 _PER_BOX = (
     *("R", "t", "origin", "edges", "edge_weight", "hinged", "prior", "prior_weight"),
@@ -122,28 +125,28 @@ def residuals(problem: BoxProblem, state: Array) -> tuple[Array, Array]:
 def _edge_rows(problem: BoxProblem, state: Array, axes: Array, residual: Array, jacobian: Array) -> None:
     """Each edge against the corner that makes it at this state (the active corner)."""
     half = 0.5 * state[:, 3:6]
-    center_cam = (problem.R @ state[:, :3, None])[..., 0] + problem.t
-    half_axes_cam = (axes * half[..., None]) @ problem.R.transpose(0, 2, 1)
-    corners = center_cam[:, None] + CORNER_SIGNS @ half_axes_cam
-    depth = np.maximum(corners[..., 2:], MIN_DEPTH_M)
-    image = corners[..., :2] / depth
-    active = np.concatenate([image.argmin(1), image.argmax(1)], 1)
+    R = problem.R
+    center_cam = (R @ state[:, :3, None])[..., 0] + problem.t
+    # Corners (N, 3, 8): coordinate by coordinate, so that extremes are sought along contiguous memory.
+    corners = (R @ (axes * half[..., None]).transpose(0, 2, 1)) @ _SIGNS_T + center_cam[..., None]
+    depth = np.maximum(corners[:, 2], MIN_DEPTH_M)
+    image = corners[:, :2] / depth[:, None]
+    active = np.concatenate([image.argmin(2), image.argmax(2)], 1)
     rows = np.arange(len(state))[:, None]
-    seen = image[rows, active, _EDGE_AXIS]
-    # The image coordinate's gradient over the corner's world position, then chained through size and yaw.
-    over_corner = (problem.R[:, _EDGE_AXIS] - seen[..., None] * problem.R[:, 2:]) / depth[rows, active]
-    over_axes = over_corner @ axes.transpose(0, 2, 1)
-    signs = CORNER_SIGNS[active]
+    seen = image[rows, _EDGE_AXIS, active]
     miss = seen - problem.edges
     # A cut edge is content when the box goes past it: below it at the left and top, above it at the right and bottom.
-    past = np.concatenate([miss[:, :2] < 0, miss[:, 2:] > 0], 1)
-    weight = np.where(problem.hinged & past, 0.0, problem.edge_weight)
+    weight = np.where(problem.hinged & (miss * _OUTWARD > 0), 0.0, problem.edge_weight)
+    # The image coordinate's gradient over the corner's world position, then chained through size and yaw.
+    scale = weight / depth[rows, active]
+    over_corner = R[:, _EDGE_AXIS] * scale[..., None] - (seen * scale)[..., None] * R[:, 2:]
+    over_axes = over_corner @ axes.transpose(0, 2, 1)
+    signs = _HALF_SIGNS[active]
     residual[:, EDGES] = miss * weight
     jacobian[:, EDGES, :3] = over_corner
-    jacobian[:, EDGES, 3:6] = 0.5 * signs * over_axes
-    reach = signs * half[:, None]
+    jacobian[:, EDGES, 3:6] = signs * over_axes
+    reach = signs[..., :2] * state[:, None, 3:5]
     jacobian[:, EDGES, 6] = reach[..., 0] * over_axes[..., 1] - reach[..., 1] * over_axes[..., 0]
-    jacobian[:, EDGES] *= weight[..., None]
 
 
 def _ground_row(problem: BoxProblem, state: Array, residual: Array, jacobian: Array) -> None:
