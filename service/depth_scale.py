@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.geometry.camera import Camera
-from service.geometry.ground import GroundPlane
+from service.geometry.ground import Ground
 from service.geometry.transforms import Array
 from service.nets.depth import InverseDepth, ReadingError
 
@@ -64,13 +64,11 @@ def cell_pixels(shape: tuple[int, ...], stride: int) -> Array:
     return np.stack(np.meshgrid(x, y), -1)
 
 
-def ground_inverse_depth(camera: Camera, ground: GroundPlane, shape: tuple[int, ...], stride: int) -> Array:
+def ground_inverse_depth(camera: Camera, ground: Ground, shape: tuple[int, ...], stride: int) -> Array:
     """1 / Z of the road at each cell (h, w); NaN above the horizon and outside ``NEAREST_M``..``FARTHEST_M``."""
     rays = camera.rays_world(cell_pixels(shape, stride))
-    # The rays have depth 1, so the multiple that reaches the ground is the depth.
-    slope = rays @ ground.normal
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = (ground.offset - camera.position_m @ ground.normal) / slope
+    road = ground.intersect(camera.position_m, rays)
+    depth = (road - camera.position_m) @ camera.R_cam_world[2]
     usable = np.isfinite(depth) & (depth > NEAREST_M) & (depth < FARTHEST_M)
     return np.where(usable, 1.0 / np.where(usable, depth, 1.0), np.nan)
 
@@ -126,7 +124,7 @@ class DepthScales:
         # Weak keys: a camera that left, or was calibrated anew, takes its scale with it.
         self._known: WeakKeyDictionary[Camera, tuple[DepthScale | None, int]] = WeakKeyDictionary()
 
-    def update(self, camera: Camera, scaled: Camera, ground: GroundPlane, inverse: InverseDepth) -> DepthScale | None:
+    def update(self, camera: Camera, scaled: Camera, ground: Ground, inverse: InverseDepth) -> DepthScale | None:
         """The scale of one camera, fitted anew every ``REFIT_EVERY`` frames and smoothed.
 
         camera: the site's camera, whose identity is the key. scaled: the same at the size of the image of ``inverse``.

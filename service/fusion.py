@@ -17,12 +17,33 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.association import Index, best_of_duplicates, gated_assignment, mahalanobis_cost
-from service.geometry.boxes import STATE_DIM, Boxes, box_states, project_extents
+from service.association import Index, best_of_duplicates, gated_assignment, inverse_2x2, mahalanobis_cost
+from service.geometry.boxes import STATE_DIM, Boxes, box_states
 from service.geometry.camera import Camera
 from service.geometry.transforms import Array, wrap_angle
+from service.views import whole_in_view
 
 _DIMS = slice(3, 6)
+
+
+@dataclass(frozen=True, eq=False)
+class CameraParts:
+    """What the cameras contributed to M fused boxes: K boxes, one a camera and vehicle."""
+
+    boxes: Boxes
+    """K boxes; their covariances include what calibration leaves open, and the shared part of the size's error."""
+    row: Index
+    """(K,) the fused box that each went into."""
+    camera: Index
+    """(K,) the camera that each came from."""
+    captured_at_ns: Index | None = None
+    """(K,) when, nanoseconds since 1970 (UTC); None: all at the set's time."""
+
+    def of_rows(self, keep: NDArray[np.bool_]) -> CameraParts:
+        """The parts of the fused boxes that a mask (M,) keeps, under the rows that these then have."""
+        mine = keep[self.row]
+        times = None if self.captured_at_ns is None else self.captured_at_ns[mine]
+        return CameraParts(self.boxes.take(mine), (np.cumsum(keep) - 1)[self.row[mine]], self.camera[mine], times)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +56,8 @@ class FusedBoxes:
     """(M, C) which cameras contributed."""
     source: Index
     """(N,) the row of ``boxes`` that each input box went into (duplicates: the row of the one that was kept)."""
+    parts: CameraParts | None = None
+    """The cameras' own measurements, for the tracker; None where they are not known."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +77,9 @@ class FusionSettings:
     0.85 m off towards each other reach it."""
     duplicate_distance_m: float = 1.0
     """Centres nearer than this are one vehicle, metres."""
-    single_view_factor: float = 0.85
-    """Score factor of a box that one camera alone reports though at least ``silent_views`` others have it in full view.
-    Mild, for another vehicle may hide it from them."""
-    silent_views: int = 2
-    """How many other cameras must be silent for that."""
+    silence_ratio: float = 0.8
+    """How much likelier a camera is silent about a real vehicle in its full view than about a false alarm of another camera.
+    Near 1, for another vehicle may hide it."""
     view_range_m: float = 40.0
     """A camera is expected to report vehicles up to this distance, metres."""
 
@@ -66,8 +87,8 @@ class FusionSettings:
 def fuse(boxes: Boxes, camera_index: Index, cameras: Sequence[Camera], settings: FusionSettings | None = None) -> FusedBoxes:
     """One box a vehicle from N boxes, ``camera_index`` (N,) saying which of the ``cameras`` lifted each.
 
-    Score: 1 - prod(1 - s) over the cameras that contributed (false alarms of different cameras rarely coincide), times
-    ``single_view_factor`` where cameras that should see the vehicle are silent.
+    Score: 1 - prod(1 - s) over the cameras that contributed (false alarms of different cameras rarely coincide); then each
+    camera that should see the vehicle and is silent multiplies the odds by ``silence_ratio``.
     """
     settings = settings or FusionSettings()
     if len(boxes) == 0:
@@ -77,31 +98,35 @@ def fuse(boxes: Boxes, camera_index: Index, cameras: Sequence[Camera], settings:
     single, owner = boxes.take(kept), camera_index[kept]
     error = _calibration_covariance(single, owner, cameras, settings)
     cluster = _cluster(single, owner, error, settings)
-    fused, members, cluster = _fuse_and_merge(single, owner, error, cluster, len(cameras), settings)
-    score = fused.score * _agreement(fused, members, cameras, settings)
+    fused, parts, cluster = _fuse_and_merge(single, owner, error, cluster, settings)
+    members = np.zeros((len(fused), len(cameras)), dtype=bool)
+    members[parts.row, parts.camera] = True
+    score = _discounted(fused.score, _silences(fused, members, cameras, settings), settings.silence_ratio)
     order = np.argsort(-score, kind="stable")
     rank = np.argsort(order)
     position = np.zeros(len(boxes), np.int64)
     position[kept] = np.arange(len(kept))
     ranked = _with_score(fused, score).take(order)
-    return FusedBoxes(ranked, members[order], rank[cluster][position[keeper]])
+    parts = CameraParts(parts.boxes, rank[parts.row], parts.camera)
+    return FusedBoxes(ranked, members[order], rank[cluster][position[keeper]], parts)
 
 
 def _calibration_covariance(boxes: Boxes, owner: Index, cameras: Sequence[Camera], settings: FusionSettings) -> Array:
     """Covariances (N, 7, 7) to add to the boxes for what calibration leaves open; height rests on the ground plane."""
-    origin = np.stack([camera.position_m for camera in cameras])[owner]
-    distance = np.linalg.norm(boxes.center[:, :2] - origin[:, :2], axis=1)
+    origin = np.stack([camera.position_m[:2] for camera in cameras])
+    offset = boxes.center[:, :2] - origin[owner]
     error = np.zeros((len(boxes), STATE_DIM, STATE_DIM))
     error[:, 2, 2] = settings.calibration_sigma_m**2
-    error[:, 0, 0] = error[:, 1, 1] = error[:, 2, 2] + (settings.calibration_sigma_rad * distance) ** 2
+    error[:, 0, 0] = error[:, 1, 1] = error[:, 2, 2] + settings.calibration_sigma_rad**2 * (offset * offset).sum(1)
     return error
 
 
 def _cluster(boxes: Boxes, owner: Index, error: Array, settings: FusionSettings) -> Index:
     """Cluster numbers (N,), 0 and up. The camera with most confidence starts; the others join one after another."""
-    xy = boxes.center[:, :2]
-    covariance = (boxes.covariance + error)[:, :2, :2]
-    information = np.linalg.inv(covariance)
+    # Relative to one box: world coordinates may be large, and information times them would round.
+    xy = boxes.center[:, :2] - boxes.center[0, :2]
+    covariance = boxes.covariance[:, :2, :2] + error[:, :2, :2]
+    information = inverse_2x2(covariance)
     weighted = (information @ xy[..., None])[..., 0]
     total = np.bincount(owner, weights=boxes.score)
     cluster = np.full(len(boxes), -1, np.int64)
@@ -109,11 +134,12 @@ def _cluster(boxes: Boxes, owner: Index, error: Array, settings: FusionSettings)
     sum_information, sum_weighted = np.zeros_like(information), np.zeros_like(weighted)
     for camera in np.argsort(-total, kind="stable"):
         mine = np.flatnonzero(owner == camera)
-        known = np.linalg.inv(sum_information[:count])
-        known_xy = (known @ sum_weighted[:count, :, None])[..., 0]
-        distance_sq, cost, distance_m = mahalanobis_cost(xy[mine], covariance[mine], known_xy, known)
-        rows, columns = gated_assignment(distance_sq, cost, distance_m, settings.gate, settings.max_distance_m)
-        cluster[mine[rows]] = columns
+        if count and len(mine):
+            known = inverse_2x2(sum_information[:count])
+            known_xy = (known @ sum_weighted[:count, :, None])[..., 0]
+            distance_sq, cost, distance_m = mahalanobis_cost(xy[mine], covariance[mine], known_xy, known)
+            rows, columns = gated_assignment(distance_sq, cost, distance_m, settings.gate, settings.max_distance_m)
+            cluster[mine[rows]] = columns
         new = mine[cluster[mine] < 0]
         cluster[new] = count + np.arange(len(new))
         count += len(new)
@@ -123,20 +149,28 @@ def _cluster(boxes: Boxes, owner: Index, error: Array, settings: FusionSettings)
 
 
 def _fuse_and_merge(
-    boxes: Boxes, owner: Index, error: Array, cluster: Index, cameras: int, settings: FusionSettings
-) -> tuple[Boxes, NDArray[np.bool_], Index]:
-    """Fused boxes, members (M, C) and clusters (N,); clusters that turn out to be one vehicle become one."""
+    boxes: Boxes, owner: Index, error: Array, cluster: Index, settings: FusionSettings
+) -> tuple[Boxes, CameraParts, Index]:
+    """Fused boxes, their parts and clusters (N,); clusters that turn out to be one vehicle become one."""
+    used = _best_per_camera(boxes, owner, cluster)
+    parts = _parts(boxes.take(used), error[used], cluster[used])
+    fused = _combine(parts, cluster[used])
     while True:
-        used = _best_per_camera(boxes, owner, cluster)
-        fused = _combine(boxes.take(used), error[used], cluster[used])
         everyone = np.zeros(len(fused), np.int64)
         keeper = best_of_duplicates(fused, everyone, settings.duplicate_iou, settings.duplicate_distance_m)
         survivors, renumbered = np.unique(keeper, return_inverse=True)
         if len(survivors) == len(fused):
-            members = np.zeros((len(fused), cameras), dtype=bool)
-            members[cluster[used], owner[used]] = True
-            return fused, members, cluster
+            return fused, CameraParts(parts, cluster[used], owner[used]), cluster
         cluster = renumbered[cluster].astype(np.int64)
+        used = _best_per_camera(boxes, owner, cluster)
+        parts = _parts(boxes.take(used), error[used], cluster[used])
+        # Only what has changed is combined again: the inverses are the dearest step.
+        changed = np.flatnonzero(np.bincount(renumbered) > 1)
+        mine = np.isin(cluster[used], changed)
+        again = _combine(parts.take(mine), np.searchsorted(changed, cluster[used][mine]))
+        row = np.arange(len(survivors))
+        row[changed] = len(survivors) + np.arange(len(changed))
+        fused = Boxes.concatenate([fused.take(survivors), again]).take(row)
 
 
 def _best_per_camera(boxes: Boxes, owner: Index, cluster: Index) -> Index:
@@ -148,14 +182,19 @@ def _best_per_camera(boxes: Boxes, owner: Index, cluster: Index) -> Index:
     return np.sort(order[first])
 
 
-def _combine(boxes: Boxes, error: Array, cluster: Index) -> Boxes:
-    """One box a cluster (numbered 0 .. M-1 without gaps) by information, size as in covariance intersection."""
-    count = np.bincount(cluster)
-    rows = len(count)
+def _parts(boxes: Boxes, error: Array, cluster: Index) -> Boxes:
+    """The boxes with covariances that may be added up as information: size n-fold, as n cameras share its error."""
     covariance = boxes.covariance + error
-    covariance[:, _DIMS, _DIMS] += (count[cluster] - 1.0)[:, None, None] * boxes.covariance[:, _DIMS, _DIMS]
-    information = np.linalg.inv(covariance)
-    axis = _circular_axis(boxes.yaw, 1.0 / covariance[:, 6, 6], cluster, rows)
+    others = np.bincount(cluster)[cluster] - 1.0
+    covariance[:, _DIMS, _DIMS] += others[:, None, None] * boxes.covariance[:, _DIMS, _DIMS]
+    return Boxes(boxes.center, boxes.dims_lwh, boxes.yaw, boxes.score, boxes.cls, covariance, boxes.flip_log_odds)
+
+
+def _combine(boxes: Boxes, cluster: Index) -> Boxes:
+    """One box a cluster (numbered 0 .. M-1 without gaps) by information."""
+    rows = int(cluster.max()) + 1
+    information = np.linalg.inv(boxes.covariance)
+    axis = _circular_axis(boxes.yaw, 1.0 / boxes.covariance[:, 6, 6], cluster, rows)
     aligned = np.cos(boxes.yaw - axis[cluster]) >= 0
     evidence = np.bincount(cluster, np.where(aligned, 1.0, -1.0) * boxes.flip_log_odds, rows)
     state = box_states(boxes)
@@ -164,10 +203,10 @@ def _combine(boxes: Boxes, error: Array, cluster: Index) -> Boxes:
     reference = np.zeros((rows, STATE_DIM))
     reference[cluster[::-1], :3] = state[::-1, :3]
     state -= reference[cluster]
-    sum_information = np.zeros((rows, STATE_DIM, STATE_DIM))
-    sum_weighted = np.zeros((rows, STATE_DIM))
-    np.add.at(sum_information, cluster, information)
-    np.add.at(sum_weighted, cluster, (information @ state[..., None])[..., 0])
+    # One product adds up the clusters, several times quicker than ``np.add.at``.
+    belongs = (np.arange(rows)[:, None] == cluster).astype(np.float64)
+    sum_information = (belongs @ information.reshape(-1, STATE_DIM**2)).reshape(rows, STATE_DIM, STATE_DIM)
+    sum_weighted = belongs @ (information @ state[..., None])[..., 0]
     fused_covariance = np.linalg.inv(sum_information)
     fused = (fused_covariance @ sum_weighted[..., None])[..., 0] + reference
     return Boxes(
@@ -190,23 +229,24 @@ def _circular_axis(yaw: Array, weight: Array, cluster: Index, rows: int) -> Arra
 
 
 def _voted_class(boxes: Boxes, cluster: Index, rows: int) -> Index:
-    votes = np.zeros((rows, int(boxes.cls.max()) + 1))
-    np.add.at(votes, (cluster, boxes.cls), boxes.score)
+    classes = int(boxes.cls.max()) + 1
+    votes = np.bincount(cluster * classes + boxes.cls, boxes.score, rows * classes).reshape(rows, classes)
     winner: Index = votes.argmax(1).astype(np.int64)
     return winner
 
 
-def _agreement(fused: Boxes, members: NDArray[np.bool_], cameras: Sequence[Camera], settings: FusionSettings) -> Array:
-    """Score factors (M,): below 1 where one camera alone reports what several others have in full view."""
-    expected = np.zeros_like(members)
-    for index, camera in enumerate(cameras):
-        extents, in_front = project_extents(camera, fused.center, fused.dims_lwh, fused.yaw)
-        inside = (extents[:, :2] >= 0).all(1) & (extents[:, 2:] <= [camera.width - 1, camera.height - 1]).all(1)
-        near = np.linalg.norm(fused.center - camera.position_m, axis=1) <= settings.view_range_m
-        expected[:, index] = in_front & inside & near
-    silent = (expected & ~members).sum(1)
-    alone = (members.sum(1) == 1) & (silent >= settings.silent_views)
-    return np.where(alone, settings.single_view_factor, 1.0)
+def _silences(fused: Boxes, members: NDArray[np.bool_], cameras: Sequence[Camera], settings: FusionSettings) -> Array:
+    """Cameras (M,) that have each box in full view, within range, and do not report it."""
+    silent = whole_in_view(fused, cameras, settings.view_range_m) & ~members
+    count: Array = silent.sum(1).astype(np.float64)
+    return count
+
+
+def _discounted(score: Array, silences: Array, ratio: float) -> Array:
+    """Scores (M,) after ``silences`` (M,) likelihood ratios of ``ratio`` each: odds times ratio^silences."""
+    kept = score * ratio**silences
+    discounted: Array = kept / (kept + 1.0 - score)
+    return discounted
 
 
 def _with_score(boxes: Boxes, score: Array) -> Boxes:

@@ -15,15 +15,17 @@ from numpy.typing import NDArray
 
 from service.geometry.boxes import BORDER_PX, STATE_DIM, Boxes, box_corners
 from service.geometry.camera import MIN_DEPTH_M, Camera
-from service.geometry.ground import GroundPlane
+from service.geometry.ground import Ground
 from service.geometry.transforms import Array, transform_points, wrap_angle
-from service.residuals import DEPTH, EDGES, ROWS, BoxProblem, NormalEquations, normal_equations
+from service.residuals import DEPTH, EDGES, GROUND, ROWS, BoxProblem, NormalEquations, normal_equations
 
 _MIN_DIM_M, _MAX_DIM_M = 0.2, 60.0
 _MIN_SIGMA_PX, _MIN_SIGMA_M, _MIN_SIGMA_RAD = 0.25, 0.01, 0.005
 _MAX_SIGMA_PX, _MAX_SIGMA_M, _MAX_SIGMA_RAD = 1e3, 30.0, np.pi
 _MIN_DEPTH_SIGMA_M, _MAX_DEPTH_M = 0.05, 1000.0
 _CONDITION_FLOOR = 1e-9
+_FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 1e-6, 1e6
+_DIAGONAL = np.arange(STATE_DIM)
 _MIN_START_DEPTH_M = 1.0
 _LENS_PASSES = 2
 _MAX_LENS_MISS = 0.1
@@ -74,19 +76,19 @@ class LiftSettings:
     """An edge this near to the image border is taken as cut by it."""
     huber_sigmas: float = 2.0
     """Edges and depths off by more than this count linearly: occlusion, a depth read off another object."""
+    ground_huber_sigmas: float = 1.0
+    """The same for the ground: real roads leave a plane by more than noise does (measured on KITTI: docs, lifting)."""
     start_sigma_m: float = 50.0
     """Weak pull to the start position; it only keeps boxes finite whose edges are all cut."""
     max_start_depth_m: float = 200.0
     """Starts farther than this (rays near the horizon) are taken from the size instead."""
     iterations: int = 6
     """Most solver steps; boxes that have converged stand still before that."""
-    step_tolerance: float = 0.05
-    """A box has converged when its step is below this share of its own sigmas."""
+    step_tolerance: float = 0.1
+    """A box has converged when its step is shorter than this, in its own sigmas (Mahalanobis)."""
 
 
-def lift(
-    cameras: Sequence[Camera], ground: GroundPlane, measurements: Measurements, settings: LiftSettings | None = None
-) -> Boxes:
+def lift(cameras: Sequence[Camera], ground: Ground, measurements: Measurements, settings: LiftSettings | None = None) -> Boxes:
     """Boxes in the world, one a detection and in their order.
 
     Finite for any finite input; what cannot be known (all edges cut, box above the horizon) shows in the covariance. A box
@@ -95,11 +97,11 @@ def lift(
     if len(measurements) == 0:
         return Boxes.empty()
     settings = settings or LiftSettings()
-    xyxy, hinged = _visible_edges(cameras, measurements, settings)
-    problem = _problem(cameras, ground, measurements, xyxy, hinged, settings)
+    seen = edge_measurements(cameras, measurements, slice(None), settings)
+    problem = _problem(ground, seen, measurements, settings)
     state, equations = _solve(problem, problem.prior, settings)
     for _ in range(_LENS_PASSES if any(camera.has_distortion for camera in cameras) else 0):
-        problem = replace(problem, edges=_straightened(cameras, measurements.camera_index, xyxy, state, problem))
+        problem = replace(problem, edges=_straightened(cameras, measurements.camera_index, seen.xyxy_px, state, problem))
         state, equations = _solve(problem, state, settings)
     return Boxes(
         center=state[:, :3],
@@ -112,55 +114,88 @@ def lift(
     )
 
 
-def _visible_edges(cameras: Sequence[Camera], m: Measurements, settings: LiftSettings) -> tuple[Array, NDArray[np.bool_]]:
-    """2D boxes (N, 4) clipped to their images, px, and which of their edges (N, 4) the border cuts."""
-    border = np.array([[camera.width - 1.0, camera.height - 1.0] for camera in cameras])[m.camera_index]
-    first, second = np.clip(m.xyxy_px[:, :2], 0.0, border), np.clip(m.xyxy_px[:, 2:], 0.0, border)
-    low, high = np.minimum(first, second), np.maximum(first, second)
-    hinged = np.concatenate([low <= settings.border_px, high >= border - settings.border_px], 1)
-    return np.concatenate([low, high], 1), hinged
+@dataclass(frozen=True, eq=False)
+class EdgeMeasurements:
+    """Measurements normalised for N boxes: what every way of lifting starts from."""
+
+    R: Array
+    """(N, 3, 3) rotation world to camera."""
+    t: Array
+    """(N, 3) translation world to camera, metres."""
+    origin: Array
+    """(N, 3) camera centre, world."""
+    xyxy_px: Array
+    """(N, 4) 2D boxes clipped to their images."""
+    hinged: NDArray[np.bool_]
+    """(N, 4) edges that the image border cuts."""
+    edges: Array
+    """(N, 4) left, top, right, bottom, in undistorted normalised coordinates."""
+    edge_weight: Array
+    """(N, 4) 1 / sigma of the edges."""
+    bottom_ray: Array
+    """(N, 3) viewing ray through the middle of the bottom edge, world, of depth 1."""
+    center_ray: Array
+    """(N, 3) through the 2D box's centre."""
+    dims_lwh: Array
+    """(N, 3) metres, within sane limits; so the sigmas below."""
+    sigma_dims: Array
+    """(N, 3) metres."""
+    yaw: Array
+    """(N,) world, radians in [-pi, pi)."""
+    sigma_yaw: Array
+    """(N,) radians."""
 
 
-def _problem(
-    cameras: Sequence[Camera],
-    ground: GroundPlane,
-    m: Measurements,
-    xyxy: Array,
-    hinged: NDArray[np.bool_],
-    settings: LiftSettings,
-) -> BoxProblem:
-    """The measurements normalised and whitened, with a start for every box."""
-    index = m.camera_index
+def edge_measurements(cameras: Sequence[Camera], m: Measurements, rows: slice, settings: LiftSettings) -> EdgeMeasurements:
+    """A slice of the measurements, normalised: through the lens, into the camera's frame, over their sigmas."""
+    index = m.camera_index[rows]
+    border = np.array([[camera.width - 1.0, camera.height - 1.0] for camera in cameras])[index]
+    xyxy = m.xyxy_px[rows]
+    low, high = np.minimum(xyxy[:, :2], xyxy[:, 2:]), np.maximum(xyxy[:, :2], xyxy[:, 2:])
+    low, high = (np.minimum(np.maximum(end, 0.0), border) for end in (low, high))
+    visible = np.concatenate([low, high], 1)
     T = np.stack([camera.T_cam_world for camera in cameras])[index]
-    origin = np.stack([camera.position_m for camera in cameras])[index]
-    focal = np.stack([camera.K[[0, 1, 0, 1], [0, 1, 0, 1]] for camera in cameras])[index]
-    points = _normalised(cameras, index, _middles(xyxy))
-    rays = np.concatenate([points, np.ones_like(points[..., :1])], -1) @ T[:, :3, :3]
-    edges = _edge_coordinates(points)
-    dims = np.clip(m.dims_lwh, _MIN_DIM_M, _MAX_DIM_M)
-    start, start_depth = _start(ground, origin, rays, edges, dims, m.yaw, settings)
-    sigma_ground = settings.ground_sigma_m + settings.ground_sigma_per_m * start_depth
-    depth, depth_weight = _depth_readings(m)
-    prior_sigma = [
-        np.full((len(m), 3), settings.start_sigma_m),
-        np.clip(m.sigma_dims, _MIN_SIGMA_M, _MAX_SIGMA_M),
-        np.clip(m.sigma_yaw, _MIN_SIGMA_RAD, _MAX_SIGMA_RAD)[:, None],
-    ]
-    huber = np.full(ROWS, np.inf)
-    huber[EDGES] = huber[DEPTH] = settings.huber_sigmas
-    return BoxProblem(
+    K = np.stack([camera.K for camera in cameras])[index]
+    points = _normalised(cameras, index, K, _middles(visible))
+    rays = np.concatenate([points[:, 3:], np.ones_like(points[:, 3:, :1])], -1) @ T[:, :3, :3]
+    return EdgeMeasurements(
         R=T[:, :3, :3],
         t=T[:, :3, 3],
-        origin=origin,
-        edges=edges,
-        edge_weight=focal / np.clip(m.sigma_px, _MIN_SIGMA_PX, _MAX_SIGMA_PX),
-        hinged=hinged,
-        prior=np.concatenate([start, dims, wrap_angle(m.yaw)[:, None]], 1),
-        prior_weight=1.0 / np.concatenate(prior_sigma, 1),
-        ground_normal=ground.normal,
-        ground_offset=ground.offset,
+        origin=np.stack([camera.position_m for camera in cameras])[index],
+        xyxy_px=visible,
+        hinged=np.concatenate([low <= settings.border_px, high >= border - settings.border_px], 1),
+        edges=np.stack([points[:, 0, 0], points[:, 1, 1], points[:, 2, 0], points[:, 3, 1]], 1),
+        edge_weight=K[:, [0, 1, 0, 1], [0, 1, 0, 1]] / np.clip(m.sigma_px[rows], _MIN_SIGMA_PX, _MAX_SIGMA_PX),
+        bottom_ray=rays[:, 0],
+        center_ray=rays[:, 1],
+        dims_lwh=np.clip(m.dims_lwh[rows], _MIN_DIM_M, _MAX_DIM_M),
+        sigma_dims=np.clip(m.sigma_dims[rows], _MIN_SIGMA_M, _MAX_SIGMA_M),
+        yaw=wrap_angle(m.yaw[rows]),
+        sigma_yaw=np.clip(m.sigma_yaw[rows], _MIN_SIGMA_RAD, _MAX_SIGMA_RAD),
+    )
+
+
+def _problem(ground: Ground, seen: EdgeMeasurements, m: Measurements, settings: LiftSettings) -> BoxProblem:
+    """The measurements whitened, with a start for every box."""
+    start, start_depth = _start(ground, seen, settings)
+    sigma_ground = settings.ground_sigma_m + settings.ground_sigma_per_m * start_depth
+    depth, depth_weight = _depth_readings(m)
+    position_sigma = np.full((len(m), 3), settings.start_sigma_m)
+    huber = np.full(ROWS, np.inf)
+    huber[EDGES] = huber[DEPTH] = settings.huber_sigmas
+    huber[GROUND] = settings.ground_huber_sigmas
+    return BoxProblem(
+        R=seen.R,
+        t=seen.t,
+        origin=seen.origin,
+        edges=seen.edges,
+        edge_weight=seen.edge_weight,
+        hinged=seen.hinged,
+        prior=np.concatenate([start, seen.dims_lwh, seen.yaw[:, None]], 1),
+        prior_weight=1.0 / np.concatenate([position_sigma, seen.sigma_dims, seen.sigma_yaw[:, None]], 1),
+        ground=ground,
         ground_weight=1.0 / sigma_ground,
-        ray=rays[:, 4],
+        ray=seen.center_ray,
         depth=depth,
         depth_weight=depth_weight,
         huber=huber,
@@ -176,23 +211,22 @@ def _depth_readings(m: Measurements) -> tuple[Array, Array]:
 
 def _middles(xyxy: Array) -> Array:
     """Middles of the left, top, right and bottom edges and the centre (N, 5, 2) of 2D boxes (N, 4), px."""
-    left, top, right, bottom = xyxy.T
-    x, y = 0.5 * (left + right), 0.5 * (top + bottom)
-    return np.stack([np.stack(p, -1) for p in ((left, y), (x, top), (right, y), (x, bottom), (x, y))], 1)
-
-
-def _normalised(cameras: Sequence[Camera], index: NDArray[np.int64], pixels: Array) -> Array:
-    """Undistorted normalised points of pixels (N, P, 2) in the cameras ``index`` (N,)."""
-    points = np.empty_like(pixels)
-    for number in np.unique(index):
-        mine = index == number
-        points[mine] = cameras[number].normalised_from_pixels(pixels[mine])
+    middle = 0.5 * (xyxy[:, :2] + xyxy[:, 2:])
+    points = np.repeat(middle[:, None], 5, axis=1)
+    points[:, [0, 1, 2, 3], [0, 1, 0, 1]] = xyxy
     return points
 
 
-def _edge_coordinates(points: Array) -> Array:
-    """Left, top, right, bottom (N, 4) from one point on each edge, (N, 4 or more, 2)."""
-    return np.stack([points[:, 0, 0], points[:, 1, 1], points[:, 2, 0], points[:, 3, 1]], 1)
+def _normalised(cameras: Sequence[Camera], index: NDArray[np.int64], K: Array, pixels: Array) -> Array:
+    """Undistorted normalised points of pixels (N, P, 2) in the cameras ``index`` (N,), whose matrices are K (N, 3, 3)."""
+    points = np.empty_like(pixels)
+    points[..., 1] = (pixels[..., 1] - K[:, 1, 2, None]) / K[:, 1, 1, None]
+    points[..., 0] = (pixels[..., 0] - K[:, 0, 2, None] - K[:, 0, 1, None] * points[..., 1]) / K[:, 0, 0, None]
+    for number, camera in enumerate(cameras):
+        if camera.has_distortion:
+            mine = index == number
+            points[mine] = camera.normalised_from_pixels(pixels[mine])
+    return points
 
 
 def _straightened(cameras: Sequence[Camera], index: NDArray[np.int64], xyxy: Array, state: Array, problem: BoxProblem) -> Array:
@@ -216,55 +250,65 @@ def _straightened(cameras: Sequence[Camera], index: NDArray[np.int64], xyxy: Arr
     return edges
 
 
-def _start(
-    ground: GroundPlane, origin: Array, rays: Array, edges: Array, dims: Array, yaw: Array, settings: LiftSettings
-) -> tuple[Array, Array]:
+def _start(ground: Ground, seen: EdgeMeasurements, settings: LiftSettings) -> tuple[Array, Array]:
     """Start centres (N, 3) and their depths (N,): the bottom edge on the ground, else the size at the seen height."""
-    down = rays[:, 3]
-    descent = down @ ground.normal
-    height = origin @ ground.normal - ground.offset
-    with np.errstate(divide="ignore", invalid="ignore"):
-        on_ground = -height / descent
-        by_size = dims[:, 2] / (edges[:, 3] - edges[:, 1])
+    down, dims = seen.bottom_ray, seen.dims_lwh
+    contact = ground.intersect(seen.origin, down)
+    # The rays have depth 1 along the optical axis, the third row of R.
+    on_ground = (seen.R[:, 2] * (contact - seen.origin)).sum(1)
     limit = settings.max_start_depth_m
+    with np.errstate(divide="ignore", invalid="ignore"):
+        by_size = dims[:, 2] / (seen.edges[:, 3] - seen.edges[:, 1])
     by_size = np.clip(np.nan_to_num(by_size, nan=limit, posinf=limit), _MIN_START_DEPTH_M, limit)
     usable = np.isfinite(on_ground) & (on_ground > _MIN_START_DEPTH_M) & (on_ground < limit)
-    contact = origin + down * np.where(usable, on_ground, 0.0)[:, None]
     # The bottom edge belongs to the nearest part of the box: its centre lies half a footprint farther on.
     azimuth = np.arctan2(down[:, 1], down[:, 0])
-    reach = 0.5 * (dims[:, 0] * np.abs(np.cos(yaw - azimuth)) + dims[:, 1] * np.abs(np.sin(yaw - azimuth)))
+    turn = seen.yaw - azimuth
+    reach = 0.5 * (dims[:, 0] * np.abs(np.cos(turn)) + dims[:, 1] * np.abs(np.sin(turn)))
     offset = np.stack([reach * np.cos(azimuth), reach * np.sin(azimuth), 0.5 * dims[:, 2]], 1)
-    start = np.where(usable[:, None], contact + offset, origin + rays[:, 4] * by_size[:, None])
+    start = np.where(usable[:, None], contact + offset, seen.origin + seen.center_ray * by_size[:, None])
     return start, np.where(usable, on_ground, by_size)
 
 
 def _solve(problem: BoxProblem, start: Array, settings: LiftSettings) -> tuple[Array, NormalEquations]:
-    """Damped Gauss-Newton on every box at once; each box has its own damping and stops by itself."""
-    state = start.copy()
-    now = normal_equations(problem, state)
-    damping = np.full(len(state), 1e-3)
-    moving = np.ones(len(state), dtype=bool)
-    diagonal = np.arange(STATE_DIM)
+    """Damped Gauss-Newton on every box at once; each box has its own damping, and leaves the batch when it has converged."""
+    state, now = start.copy(), normal_equations(problem, start)
+    total = now
+    rows = np.arange(len(start))
+    damping = np.full(len(start), _FIRST_DAMPING)
+    moving = state
     for _ in range(settings.iterations):
-        scale = now.hessian[:, diagonal, diagonal]
         damped = now.hessian.copy()
-        damped[:, diagonal, diagonal] += damping[:, None] * scale
+        damped[:, _DIAGONAL, _DIAGONAL] *= 1.0 + damping[:, None]
         step = np.linalg.solve(damped, -now.gradient[..., None])[..., 0]
-        trial = state + step
-        trial[:, 3:6] = np.clip(trial[:, 3:6], _MIN_DIM_M, _MAX_DIM_M)
+        trial = moving + step
+        np.minimum(np.maximum(trial[:, 3:6], _MIN_DIM_M), _MAX_DIM_M, out=trial[:, 3:6])
         then = normal_equations(problem, trial)
-        better = moving & (then.cost <= now.cost)
-        state = np.where(better[:, None], trial, state)
-        now = NormalEquations(
-            np.where(better, then.cost, now.cost),
-            np.where(better[:, None], then.gradient, now.gradient),
-            np.where(better[:, None, None], then.hessian, now.hessian),
-        )
-        damping = np.clip(np.where(better, 0.2 * damping, 10.0 * damping), 1e-6, 1e6)
-        moving &= ~(better & (np.abs(step) * np.sqrt(scale) < settings.step_tolerance).all(1))
-        if not moving.any():
+        better = then.cost <= now.cost
+        # Twice what the quadratic model promises: the step's squared length in the box's own sigmas.
+        going = -(now.gradient * step).sum(1) > settings.step_tolerance**2
+        if not better.all():
+            trial, then = np.where(better[:, None], trial, moving), _chosen(better, then, now)
+        if len(rows) == len(start):
+            state, total = trial, then
+        else:
+            state[rows] = trial
+            for kept, new in zip(total, then, strict=True):
+                kept[rows] = new
+        if not going.any():
             break
-    return state, now
+        damping = np.minimum(np.maximum(damping * np.where(better, 0.2, 10.0), _MIN_DAMPING), _MAX_DAMPING)
+        moving, now = trial, then
+        if not going.all():
+            rows, damping, moving, problem = rows[going], damping[going], trial[going], problem.take(going)
+            now = NormalEquations(*(kept[going] for kept in then))
+    return state, total
+
+
+def _chosen(better: NDArray[np.bool_], then: NormalEquations, now: NormalEquations) -> NormalEquations:
+    """``then`` where the step was better (N,), else ``now``."""
+    pick = [better.reshape(-1, *(1,) * (new.ndim - 1)) for new in then]
+    return NormalEquations(*(np.where(p, new, old) for p, new, old in zip(pick, then, now, strict=True)))
 
 
 def _covariance(hessian: Array) -> Array:

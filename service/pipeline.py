@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from service.depth_scale import DepthReadings, DepthScales, read_boxes
 from service.errors import FrameError
 from service.frames import FrameSet, decode
-from service.fusion import FusionSettings, fuse
+from service.fusion import CameraParts, FusedBoxes, FusionSettings, fuse
 from service.geometry.boxes import Boxes, clip_extents, cut_edges
 from service.geometry.camera import Camera, UInt8Image, yaw_from_alpha
 from service.lifting import LiftSettings, Measurements, lift
@@ -23,12 +24,19 @@ from service.nets.depth import DepthNet
 from service.nets.detector import Detections, Detector, edge_sigma
 from service.nets.multibin import Multibin, MultibinEstimates, crop_vehicles
 from service.nets.pack import Pack
+from service.paper_fusion import PaperFusionSettings, fuse_paper
+from service.site import Site
+
+_UNKNOWN_YAW_SIGMA = np.pi / np.sqrt(3.0)
+"""Standard deviation of an angle that may be any, radians."""
 
 
 @dataclass(frozen=True)
 class PipelineSettings:
     """What can be set of the pipeline; the rest comes from the pack and the site."""
 
+    method: Literal["map", "paper"] = "map"
+    """How boxes are lifted and fused: by maximum a posteriori and information, or as in the source paper."""
     score_threshold: float = 0.3
     """2D detections of a lower score are dropped."""
     nms_iou: float = 0.55
@@ -37,9 +45,11 @@ class PipelineSettings:
     """Fused boxes of a lower score are dropped."""
     max_position_sigma_m: float = 1.2
     """Fused boxes whose place on the road is less certain (one sigma, both axes together) are dropped: mostly vehicles that one
-    camera alone sees, from far away, often beside their own box from the other cameras. ``per_camera`` has them."""
+    camera alone sees, from far away, often beside their own box from the other cameras. ``per_camera`` has them. The paper's
+    method knows no such limit."""
     lift: LiftSettings = field(default_factory=LiftSettings)
     fusion: FusionSettings = field(default_factory=FusionSettings)
+    paper_fusion: PaperFusionSettings = field(default_factory=PaperFusionSettings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +72,8 @@ class SetResult:
     """Wall time of each step."""
     failed: dict[str, FrameError]
     """Cameras whose frame could not be decoded."""
+    parts: CameraParts | None = None
+    """What each camera contributed to ``boxes``, and when, for the tracker; cameras as in ``camera_ids``."""
 
 
 class Pipeline:
@@ -101,9 +113,9 @@ class Pipeline:
             readings = self._read_depth(frame_set, cameras, images, found)
         with _timed(timing, "lift"):
             measurements = self._measurements(cameras, found, estimates, readings)
-            lifted = lift(cameras, frame_set.site.ground, measurements, self.settings.lift)
+            lifted = self._lift(cameras, frame_set.site, measurements)
         with _timed(timing, "fuse"):
-            fused = fuse(lifted, measurements.camera_index, cameras, self.settings.fusion)
+            fused = self._fuse(lifted, measurements.camera_index, cameras)
             keep = self._reported(fused.boxes)
         timing["total"] = 1e3 * (time.perf_counter() - started)
         return SetResult(
@@ -115,11 +127,28 @@ class Pipeline:
             detections={camera.id: len(detections) for camera, detections in zip(cameras, found, strict=True)},
             timing_ms=timing,
             failed=failed,
+            parts=None if fused.parts is None else _timed_parts(fused.parts.of_rows(keep), frame_set, cameras),
         )
 
+    def _lift(self, cameras: list[Camera], site: Site, measurements: Measurements) -> Boxes:
+        if self.settings.method == "paper":
+            # Imported here: the default method does not pay for it.
+            from service.paper_lifting import lift_paper
+
+            return lift_paper(cameras, site.ground, measurements, self.settings.lift)
+        return lift(cameras, site.ground, measurements, self.settings.lift)
+
+    def _fuse(self, lifted: Boxes, camera_index: NDArray[np.int64], cameras: list[Camera]) -> FusedBoxes:
+        if self.settings.method == "paper":
+            return fuse_paper(lifted, camera_index, cameras, self.settings.paper_fusion)
+        return fuse(lifted, camera_index, cameras, self.settings.fusion)
+
     def _reported(self, boxes: Boxes) -> NDArray[np.bool_]:
+        confident = boxes.score >= self.settings.min_fused_score
+        if self.settings.method == "paper":
+            return confident
         sigma = np.sqrt(boxes.covariance[:, 0, 0] + boxes.covariance[:, 1, 1])
-        return (boxes.score >= self.settings.min_fused_score) & (sigma <= self.settings.max_position_sigma_m)
+        return confident & (sigma <= self.settings.max_position_sigma_m)
 
     def _decode(self, frame_set: FrameSet) -> tuple[list[Camera], list[UInt8Image], dict[str, FrameError]]:
         """Images, and the cameras at the images' sizes."""
@@ -158,9 +187,12 @@ class Pipeline:
         xyxy = np.concatenate([clip_extents(camera, d.xyxy_px) for camera, d in zip(cameras, found, strict=True)])
         centers = (xyxy[:, :2] + xyxy[:, 2:]) / 2
         yaw, is_cut = np.zeros(len(index)), np.zeros(len(index), dtype=bool)
+        # A quantised network can give a heading vector of length zero, whose angle is not a number.
+        headed = np.isfinite(estimates.alpha)
+        alpha = np.where(headed, estimates.alpha, 0.0)
         for row, camera in enumerate(cameras):
             own = index == row
-            yaw[own] = yaw_from_alpha(camera, estimates.alpha[own], centers[own])
+            yaw[own] = yaw_from_alpha(camera, alpha[own], centers[own])
             is_cut[own] = cut_edges(camera, xyxy[own]).any(1)
         spec = self.multibin.spec
         score = np.concatenate([d.score for d in found])
@@ -171,13 +203,20 @@ class Pipeline:
             dims_lwh=estimates.dims_lwh,
             sigma_dims=np.stack([model.sigma(score, is_cut) for model in spec.sigma_dims_lwh], 1),
             yaw=yaw,
-            sigma_yaw=spec.sigma_alpha_rad.sigma(score, is_cut),
-            flip_log_odds=estimates.flip_log_odds,
+            sigma_yaw=np.where(headed, spec.sigma_alpha_rad.sigma(score, is_cut), _UNKNOWN_YAW_SIGMA),
+            flip_log_odds=np.where(headed, estimates.flip_log_odds, 0.0),
             score=score,
             cls=np.concatenate([d.cls for d in found]),
             depth_m=readings.depth_m,
             sigma_depth_m=readings.sigma_m,
         )
+
+
+def _timed_parts(parts: CameraParts, frame_set: FrameSet, cameras: list[Camera]) -> CameraParts:
+    """The parts with their cameras' capture times; the set's time where a camera has none of its own."""
+    own = {frame.camera_id: frame.captured_at_ns for frame in frame_set.frames if frame.captured_at_ns is not None}
+    times = np.array([own.get(camera.id, frame_set.captured_at_ns) for camera in cameras], dtype=np.int64)
+    return replace(parts, captured_at_ns=times[parts.camera])
 
 
 @contextmanager

@@ -6,13 +6,15 @@ undistorted normalised coordinates (x/z, y/z); distances there are pixels over t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.geometry.boxes import CORNER_SIGNS, STATE_DIM
 from service.geometry.camera import MIN_DEPTH_M
+from service.geometry.ground import Ground
 from service.geometry.transforms import Array, wrap_angle
 
 EDGES, GROUND, DEPTH = slice(0, 4), 4, 5
@@ -21,6 +23,15 @@ EDGES, GROUND, DEPTH = slice(0, 4), 4, 5
 ROWS = 6
 _EDGE_AXIS = np.array([0, 1, 0, 1])
 _FAR_PARALLEL = 1e-9
+_TINY = 1e-30
+_SIGNS_T = np.ascontiguousarray(CORNER_SIGNS.T)
+_HALF_SIGNS = 0.5 * CORNER_SIGNS
+_OUTWARD = np.array([-1.0, -1.0, 1.0, 1.0])
+_DIAGONAL = np.arange(STATE_DIM)
+_PER_BOX = (
+    *("R", "t", "origin", "edges", "edge_weight", "hinged", "prior", "prior_weight"),
+    *("ground_weight", "ray", "depth", "depth_weight"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +54,8 @@ class BoxProblem:
     """(N, 7) start position, predicted size, predicted yaw."""
     prior_weight: Array
     """(N, 7) 1 / sigma of the prior."""
-    ground_normal: Array
-    """(3,) unit normal of the ground plane, world."""
-    ground_offset: float
-    """Offset of the ground plane, metres."""
+    ground: Ground
+    """The road, world."""
     ground_weight: Array
     """(N,) 1 / sigma, 1/m."""
     ray: Array
@@ -58,9 +67,12 @@ class BoxProblem:
     huber: Array
     """(6,) residual (sigmas) from which a row counts linearly."""
 
+    def take(self, index: NDArray[np.bool_]) -> BoxProblem:
+        """The boxes at a mask (N,)."""
+        return replace(self, **{name: getattr(self, name)[index] for name in _PER_BOX})
 
-@dataclass(frozen=True, eq=False)
-class NormalEquations:
+
+class NormalEquations(NamedTuple):
     """Cost (N,), gradient (N, 7) and Gauss-Newton Hessian (N, 7, 7) of N boxes."""
 
     cost: Array
@@ -83,14 +95,14 @@ def normal_equations(problem: BoxProblem, state: Array) -> NormalEquations:
     residual, jacobian = residuals(problem, state)
     magnitude = np.abs(residual)
     inner = np.minimum(magnitude, problem.huber)
-    robust = np.divide(inner, magnitude, out=np.ones_like(inner), where=magnitude > 0)
+    robust = np.maximum(inner, _TINY) / np.maximum(magnitude, _TINY)
     offset = state - problem.prior
     offset[:, 6] = wrap_angle(offset[:, 6])
-    pull = offset * problem.prior_weight**2
+    information = problem.prior_weight * problem.prior_weight
+    pull = offset * information
     weighted_t = (jacobian * robust[..., None]).transpose(0, 2, 1)
     hessian = weighted_t @ jacobian
-    diagonal = np.arange(STATE_DIM)
-    hessian[:, diagonal, diagonal] += problem.prior_weight**2
+    hessian[:, _DIAGONAL, _DIAGONAL] += information
     gradient = (weighted_t @ residual[..., None])[..., 0] + pull
     cost = (inner * (magnitude - 0.5 * inner)).sum(1) + 0.5 * (offset * pull).sum(1)
     return NormalEquations(cost, gradient, hessian)
@@ -113,37 +125,38 @@ def residuals(problem: BoxProblem, state: Array) -> tuple[Array, Array]:
 def _edge_rows(problem: BoxProblem, state: Array, axes: Array, residual: Array, jacobian: Array) -> None:
     """Each edge against the corner that makes it at this state (the active corner)."""
     half = 0.5 * state[:, 3:6]
-    center_cam = (problem.R @ state[:, :3, None])[..., 0] + problem.t
-    half_axes_cam = (axes * half[..., None]) @ problem.R.transpose(0, 2, 1)
-    corners = center_cam[:, None] + CORNER_SIGNS @ half_axes_cam
-    depth = np.maximum(corners[..., 2:], MIN_DEPTH_M)
-    image = corners[..., :2] / depth
-    active = np.concatenate([image.argmin(1), image.argmax(1)], 1)
+    R = problem.R
+    center_cam = (R @ state[:, :3, None])[..., 0] + problem.t
+    # Corners (N, 3, 8): coordinate by coordinate, so that extremes are sought along contiguous memory.
+    corners = (R @ (axes * half[..., None]).transpose(0, 2, 1)) @ _SIGNS_T + center_cam[..., None]
+    depth = np.maximum(corners[:, 2], MIN_DEPTH_M)
+    image = corners[:, :2] / depth[:, None]
+    active = np.concatenate([image.argmin(2), image.argmax(2)], 1)
     rows = np.arange(len(state))[:, None]
-    seen = image[rows, active, _EDGE_AXIS]
-    # The image coordinate's gradient over the corner's world position, then chained through size and yaw.
-    over_corner = (problem.R[:, _EDGE_AXIS] - seen[..., None] * problem.R[:, 2:]) / depth[rows, active]
-    over_axes = over_corner @ axes.transpose(0, 2, 1)
-    signs = CORNER_SIGNS[active]
+    seen = image[rows, _EDGE_AXIS, active]
     miss = seen - problem.edges
     # A cut edge is content when the box goes past it: below it at the left and top, above it at the right and bottom.
-    past = np.concatenate([miss[:, :2] < 0, miss[:, 2:] > 0], 1)
-    weight = np.where(problem.hinged & past, 0.0, problem.edge_weight)
+    weight = np.where(problem.hinged & (miss * _OUTWARD > 0), 0.0, problem.edge_weight)
+    # The image coordinate's gradient over the corner's world position, then chained through size and yaw.
+    scale = weight / depth[rows, active]
+    over_corner = R[:, _EDGE_AXIS] * scale[..., None] - (seen * scale)[..., None] * R[:, 2:]
+    over_axes = over_corner @ axes.transpose(0, 2, 1)
+    signs = _HALF_SIGNS[active]
     residual[:, EDGES] = miss * weight
     jacobian[:, EDGES, :3] = over_corner
-    jacobian[:, EDGES, 3:6] = 0.5 * signs * over_axes
-    reach = signs * half[:, None]
+    jacobian[:, EDGES, 3:6] = signs * over_axes
+    reach = signs[..., :2] * state[:, None, 3:5]
     jacobian[:, EDGES, 6] = reach[..., 0] * over_axes[..., 1] - reach[..., 1] * over_axes[..., 0]
-    jacobian[:, EDGES] *= weight[..., None]
 
 
 def _ground_row(problem: BoxProblem, state: Array, residual: Array, jacobian: Array) -> None:
-    """Centre of the bottom face on the ground plane."""
-    normal = problem.ground_normal
-    gap = state[:, :3] @ normal - 0.5 * normal[2] * state[:, 5] - problem.ground_offset
-    residual[:, GROUND] = gap * problem.ground_weight
-    jacobian[:, GROUND, :3] = normal * problem.ground_weight[:, None]
-    jacobian[:, GROUND, 5] = -0.5 * normal[2] * problem.ground_weight
+    """Centre of the bottom face on the ground, or on its tangent plane below the box where the ground is a grid."""
+    normal, offset = problem.ground.tangent_at(state[:, :2])
+    weight = problem.ground_weight
+    gap = (state[:, :3] * normal).sum(1) - 0.5 * normal[..., 2] * state[:, 5] - offset
+    residual[:, GROUND] = gap * weight
+    jacobian[:, GROUND, :3] = normal * weight[:, None]
+    jacobian[:, GROUND, 5] = -0.5 * normal[..., 2] * weight
 
 
 def _depth_row(problem: BoxProblem, state: Array, axes: Array, residual: Array, jacobian: Array) -> None:

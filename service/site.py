@@ -1,4 +1,4 @@
-"""A site: its cameras, its ground plane, its origin on the globe; read from and written to ``site.json``."""
+"""A site: its cameras, its ground, its origin on the globe; read from and written to ``site.json``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from service.errors import CalibrationError, NotFoundError
 from service.geometry.camera import Camera
-from service.geometry.ground import GroundPlane
+from service.geometry.ground import MAX_NODES, Ground, GroundGrid, GroundPlane
 
 ID_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 """Ids of sites and cameras: safe in URLs, file names and form fields."""
@@ -45,11 +45,20 @@ class OriginModel(_Strict):
     alt: Finite = 0.0
 
 
+class GridModel(_Strict):
+    """Heights of the road on a regular grid: rows along y, columns along x, from ``origin_xy`` on, metres."""
+
+    origin_xy: Annotated[list[Finite], Field(min_length=2, max_length=2)]
+    cell_m: Annotated[float, Field(ge=0.1, le=1000.0, allow_inf_nan=False)]
+    heights: Annotated[list[Annotated[list[Finite], Field(min_length=2)]], Field(min_length=2)]
+
+
 class GroundModel(_Strict):
-    """The ground plane ``normal . p = offset`` in the world, metres."""
+    """The ground plane ``normal . p = offset`` in the world, metres; a grid, where given, takes its place."""
 
     normal: Row3 = Field(default_factory=lambda: [0.0, 0.0, 1.0])
     offset: Finite = 0.0
+    grid: GridModel | None = None
 
 
 class CameraModel(_Strict):
@@ -78,7 +87,7 @@ class Site:
 
     id: str
     cameras: tuple[Camera, ...] = ()
-    ground: GroundPlane = field(default_factory=GroundPlane)
+    ground: Ground = field(default_factory=GroundPlane)
     origin: OriginModel = field(default_factory=OriginModel)
 
     def camera(self, camera_id: str) -> Camera:
@@ -127,7 +136,9 @@ def parse_site(document: Any) -> Site:
     return Site(model.id, cameras, _ground(model.ground), model.origin)
 
 
-def _ground(model: GroundModel) -> GroundPlane:
+def _ground(model: GroundModel) -> Ground:
+    if model.grid is not None:
+        return _grid(model.grid)
     normal = np.array(model.normal)
     length = float(np.linalg.norm(normal))
     if length < 1e-6 or normal[2] / length < 0.5:
@@ -137,6 +148,17 @@ def _ground(model: GroundModel) -> GroundPlane:
             remedy="World is East, North, up; a level road has normal [0, 0, 1].",
         )
     return GroundPlane(normal / length, model.offset / length)
+
+
+def _grid(model: GridModel) -> GroundGrid:
+    lengths = {len(row) for row in model.heights}
+    if len(lengths) > 1 or len(model.heights) * max(lengths) > MAX_NODES:
+        raise CalibrationError(
+            f"{len(model.heights)} rows of {min(lengths)} to {max(lengths)} heights.",
+            field="ground.grid.heights",
+            remedy=f"All rows have the same length, and there are at most {MAX_NODES} heights.",
+        )
+    return GroundGrid(np.array(model.origin_xy), model.cell_m, np.array(model.heights))
 
 
 def _camera(model: CameraModel, where: str) -> Camera:
@@ -179,7 +201,7 @@ def site_document(site: Site) -> dict[str, Any]:
     return {
         "id": site.id,
         "origin": site.origin.model_dump(),
-        "ground": {"normal": site.ground.normal.tolist(), "offset": site.ground.offset},
+        "ground": _ground_document(site.ground),
         "cameras": [
             {
                 "id": c.id,
@@ -192,6 +214,13 @@ def site_document(site: Site) -> dict[str, Any]:
             for c in site.cameras
         ],
     }
+
+
+def _ground_document(ground: Ground) -> dict[str, Any]:
+    if isinstance(ground, GroundPlane):
+        return {"normal": ground.normal.tolist(), "offset": ground.offset}
+    grid = {"origin_xy": ground.origin_xy.tolist(), "cell_m": ground.cell_m, "heights": ground.heights.tolist()}
+    return {"grid": grid}
 
 
 def load_site(path: Path) -> Site:

@@ -8,7 +8,7 @@ import numpy as np
 from rich.table import Table
 
 from service.geometry.camera import Camera
-from service.geometry.ground import GroundPlane
+from service.geometry.ground import Ground
 from service.geometry.transforms import Array
 from service.site import Site
 
@@ -68,7 +68,7 @@ def report_table(site: Site, reports: list[CameraReport]) -> Table:
     return table
 
 
-def _report(camera: Camera, ground: GroundPlane) -> CameraReport:
+def _report(camera: Camera, ground: Ground) -> CameraReport:
     position = camera.position_m
     rows = np.linspace(camera.height - 1, 0, _COLUMN_SAMPLES)
     rays = camera.rays_world(np.stack([np.full_like(rows, (camera.width - 1) / 2), rows], -1))

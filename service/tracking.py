@@ -1,51 +1,60 @@
-"""Tracking: identities, velocities and headings over time, one tracker a site.
+"""Tracking: identities, speeds and headings over time, one tracker a site.
 
-A constant-velocity Kalman filter in x, y, z with real time steps; size and yaw are filtered beside it, yaw on the circle.
-All tracks are advanced and updated at once as arrays.
+Boxes are assigned to tracks in bird's-eye view, and an extended Kalman filter (:mod:`service.motion`) with real time steps
+follows each. What feeds it is each camera's own measurement with its own covariance: cameras of one capture time together,
+which is what :func:`service.fusion.fuse` adds up, and cameras of different times one after another. All tracks move at
+once, as arrays.
+
+Sets that arrive late are put in their place: the tracker goes back to where it stood before them, and repeats what came
+since.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections import deque
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.association import Index, gated_assignment, mahalanobis_cost
-from service.fusion import FusedBoxes
-from service.geometry.boxes import STATE_DIM, Boxes
+from service.fusion import CameraParts, FusedBoxes
+from service.geometry.boxes import STATE_DIM, Boxes, box_states
 from service.geometry.transforms import Array, wrap_angle
+from service.motion import SPEED, YAW, MotionSettings, blurred, corrected, newborn, predicted, turned_about, velocity
 
-_POSITION, _VELOCITY = slice(0, 3), slice(3, 6)
+_BOX = slice(0, STATE_DIM)
 _NS_PER_S = 1e9
+_MAX_SCORE = 0.99
 
 
 @dataclass(frozen=True)
 class TrackSettings:
     """Tuning of the tracker."""
 
-    gate: float = 9.21
-    """Largest squared Mahalanobis distance of a match: 99 % of a chi-square with 2 degrees of freedom."""
+    gate: float = 18.4
+    """Largest squared Mahalanobis distance of a match: 99.99 % of a chi-square with 2 degrees of freedom. Wider than that of
+    fusion, for a vehicle passes it hundreds of times."""
     max_distance_m: float = 4.0
     """Farthest that a box may lie from where its track was expected, metres."""
-    lost_after_s: float = 1.0
-    """A track that nothing matched for this long is dropped; until then it coasts, unreported."""
-    acceleration_sigma: float = 3.0
-    """Manoeuvres along the ground that the filter expects, m/s^2."""
-    climb_sigma: float = 0.3
-    """The same for the vertical, m/s^2."""
-    birth_speed_sigma: float = 10.0
-    """Speed that a new track may have, m/s (one sigma)."""
-    size_drift_m: float = 0.05
-    """Random walk of the size, metres after one second."""
-    yaw_drift_rad: float = 0.5
-    """Random walk of the yaw, radians after one second."""
+    hit_log_odds: float = 1.0
+    """What a box adds to the log-odds that its vehicle exists, beside the log-odds of its own score."""
+    fade_per_s: float = 2.5
+    """What each second unseen takes from them. A track whose existence is less likely than not is dropped; until then it
+    coasts, unreported."""
+    max_log_odds: float = 8.0
+    """Cap on them, so that a vehicle that left is dropped in a few seconds."""
     heading_speed_mps: float = 1.0
-    """Above this speed a vehicle's heading follows its velocity; below, its past heading."""
+    """Above this speed a vehicle's heading follows its motion; below, its past heading."""
     heading_sigmas: float = 4.0
     """The speed must also stand out from its own uncertainty by this factor: jitter of a new track is no motion."""
     max_flip_evidence: float = 6.0
     """Cap on the log-odds that a track gathers for its direction, so that it can change its mind."""
+    late_s: float = 1.0
+    """Sets that arrive later than this behind the newest one count as of the newest one's time."""
+    same_time_s: float = 0.001
+    """Cameras less apart in time than this count as simultaneous."""
+    motion: MotionSettings = field(default_factory=MotionSettings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +69,10 @@ class TrackedBoxes:
     """M ids, unique for the life of the tracker: "1", "2", ..."""
     velocity: Array
     """(M, 3) world, m/s; zero for a vehicle seen for the first time."""
+    speed_sigma: Array | None = None
+    """(M,) standard deviation of the speed, m/s."""
+    existence: Array | None = None
+    """(M,) probability that the vehicle exists, by all that was seen of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,16 +81,13 @@ class _Tracks:
 
     number: Index
     state: Array
-    """(T, 6) x y z vx vy vz."""
+    """(T, 9) x y z l w h yaw speed yaw rate."""
     covariance: Array
-    """(T, 6, 6)."""
-    dims: Array
-    dims_covariance: Array
-    yaw: Array
-    yaw_variance: Array
+    """(T, 9, 9)."""
     flip_evidence: Array
-    """(T,) log-odds gathered for ``yaw`` against ``yaw + pi``; never negative."""
-    unseen_s: Array
+    """(T,) log-odds gathered for the yaw against its opposite; never negative."""
+    existence: Array
+    """(T,) log-odds that the vehicle exists."""
 
     def take(self, index: Index | NDArray[np.bool_]) -> _Tracks:
         return _Tracks(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
@@ -86,36 +96,69 @@ class _Tracks:
         return _Tracks(**{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)})
 
 
+@dataclass(frozen=True, eq=False)
+class _Past:
+    """A set that was tracked, and what it takes to do so again."""
+
+    at_ns: int
+    fused: FusedBoxes
+    before: _Tracks
+    """The tracks as they stood at ``before_ns``."""
+    before_ns: int
+    number: Index
+    """(M,) the identities that were given."""
+
+
 class Tracker:
-    """The tracks of one site. Not thread-safe: one caller, in the order of capture."""
+    """The tracks of one site. Not thread-safe: one caller. Sets may come out of the order of capture."""
 
     def __init__(self, settings: TrackSettings | None = None) -> None:
         self._settings = settings or TrackSettings()
-        self._tracks = _born(Boxes.empty(), 1, self._settings)
+        self._tracks = _born(Boxes.empty(), np.zeros(0, np.int64), 0.0, self._settings)
+        self._now_ns: int | None = None
         self._next_number = 1
-        self._last_ns: int | None = None
+        self._past: deque[_Past] = deque()
 
     def update(self, fused: FusedBoxes, captured_at_ns: int) -> TrackedBoxes:
         """Take the boxes of one frame set captured at ``captured_at_ns`` (UTC) and give them back tracked.
 
-        Every box comes back at once, new ones under a new id. A capture time before the last one counts as the same time.
+        Every box comes back at once, new ones under a new id. Where ``fused.parts`` has the cameras' own boxes and times, those
+        feed the filter. A set captured before the last one is put in its place if that is less than ``late_s`` ago.
         """
-        elapsed_s = 0.0 if self._last_ns is None else max(0.0, (captured_at_ns - self._last_ns) / _NS_PER_S)
-        self._last_ns = captured_at_ns
-        tracks = _advance(self._tracks, elapsed_s, self._settings)
-        tracks = tracks.take(tracks.unseen_s <= self._settings.lost_after_s)
-        boxes = fused.boxes
-        rows, columns = self._match(boxes, tracks)
-        fresh = np.setdiff1d(np.arange(len(boxes)), rows)
-        born = _born(boxes.take(fresh), self._next_number, self._settings)
-        self._next_number += len(fresh)
-        seen = _corrected(tracks.take(columns), boxes.take(rows), self._settings).joined(born)
-        coasting = tracks.take(np.setdiff1d(np.arange(len(tracks.number)), columns))
-        self._tracks = seen.joined(coasting)
-        in_order = seen.take(np.argsort(np.concatenate([rows, fresh])))
-        return TrackedBoxes(
-            _filtered(boxes, in_order), fused.members, [str(number) for number in in_order.number], in_order.state[:, _VELOCITY]
-        )
+        oldest_ns = self._past[0].at_ns if self._past else captured_at_ns
+        if self._now_ns is None or captured_at_ns >= self._now_ns or captured_at_ns < oldest_ns:
+            at_ns = captured_at_ns if self._now_ns is None else max(captured_at_ns, self._now_ns)
+            return self._result(fused, self._step(fused, at_ns))
+        later = [past for past in self._past if past.at_ns > captured_at_ns]
+        self._past = deque(past for past in self._past if past.at_ns <= captured_at_ns)
+        self._tracks, self._now_ns = later[0].before, later[0].before_ns
+        first_new = self._next_number
+        seen = self._step(fused, captured_at_ns)
+        for past in later:
+            again = self._step(past.fused, past.at_ns)
+            seen = self._renamed(seen, again.number, past.number, first_new)
+        return self._result(fused, seen)
+
+    def _step(self, fused: FusedBoxes, at_ns: int) -> _Tracks:
+        """One set in order of time; its tracks (M) in the order of the boxes."""
+        before, before_ns = self._tracks, at_ns if self._now_ns is None else self._now_ns
+        boxes, settings = fused.boxes, self._settings
+        tracks = _advanced(before, (at_ns - before_ns) / _NS_PER_S, settings)
+        age_s, spread_s = _ages(fused.parts, at_ns, settings)
+        then_s = max((at_ns - before_ns) / _NS_PER_S - age_s, 0.0)
+        rows, columns = self._match(boxes, self._expected(before, tracks, then_s, spread_s) if age_s + spread_s else tracks)
+        is_new = np.ones(len(boxes), dtype=bool)
+        is_new[rows] = False
+        born = _born(boxes.take(is_new), self._next_number + np.arange(int(is_new.sum())), age_s, settings)
+        self._next_number += len(born.number)
+        matched = np.zeros(len(tracks.number), dtype=bool)
+        matched[columns] = True
+        fed = _fed(before, tracks, fused, (rows, columns), (before_ns, at_ns), age_s + spread_s > 0, settings)
+        joined = fed.joined(born)
+        seen = joined.take(np.argsort(np.concatenate([rows, np.flatnonzero(is_new)])))
+        self._tracks, self._now_ns = joined.joined(tracks.take(~matched)), at_ns
+        self._remember(_Past(at_ns, fused, before, before_ns, seen.number))
+        return seen
 
     def _match(self, boxes: Boxes, tracks: _Tracks) -> tuple[Index, Index]:
         distance_sq, cost, distance_m = mahalanobis_cost(
@@ -123,103 +166,143 @@ class Tracker:
         )
         return gated_assignment(distance_sq, cost, distance_m, self._settings.gate, self._settings.max_distance_m)
 
+    def _expected(self, before: _Tracks, tracks: _Tracks, elapsed_s: float, spread_s: float) -> _Tracks:
+        """``tracks`` at the cameras' mean time, as vague as those differ: what fused boxes are to be compared with."""
+        then = _of_numbers(before, tracks.number)
+        state, covariance = predicted(then.state, then.covariance, elapsed_s, self._settings.motion)
+        return replace(tracks, state=state, covariance=blurred(state, covariance, spread_s))
 
-def _born(boxes: Boxes, first_number: int, settings: TrackSettings) -> _Tracks:
-    """New tracks, at rest but with a speed that nobody knows."""
-    count = len(boxes)
-    covariance = np.zeros((count, 6, 6))
-    covariance[:, _POSITION, _POSITION] = boxes.covariance[:, :3, :3]
-    covariance[:, _VELOCITY, _VELOCITY] = np.diag([settings.birth_speed_sigma**2] * 2 + [settings.climb_sigma**2])
-    return _Tracks(
-        number=first_number + np.arange(count),
-        state=np.concatenate([boxes.center, np.zeros((count, 3))], 1),
-        covariance=covariance,
-        dims=boxes.dims_lwh,
-        dims_covariance=boxes.covariance[:, 3:6, 3:6],
-        yaw=wrap_angle(boxes.yaw + np.where(boxes.flip_log_odds < 0, np.pi, 0.0)),
-        yaw_variance=boxes.covariance[:, 6, 6],
-        flip_evidence=np.minimum(np.abs(boxes.flip_log_odds), settings.max_flip_evidence),
-        unseen_s=np.zeros(count),
-    )
+    def _renamed(self, seen: _Tracks, now: Index, published: Index, first_new: int) -> _Tracks:
+        """``seen`` after tracks that a late set brought about took the identities published for them before, where free."""
+        changed = (now >= first_new) & (now != published) & ~np.isin(published, self._tracks.number)
+        names = dict(zip(now[changed].tolist(), published[changed].tolist(), strict=True))
+        if names:
+            self._tracks, seen = _with_names(self._tracks, names), _with_names(seen, names)
+            last = self._past.pop()
+            self._past.append(replace(last, number=np.array([names.get(n, n) for n in last.number.tolist()], np.int64)))
+        return seen
+
+    def _remember(self, past: _Past) -> None:
+        self._past.append(past)
+        while past.at_ns - self._past[0].at_ns > self._settings.late_s * _NS_PER_S:
+            self._past.popleft()
+
+    def _result(self, fused: FusedBoxes, seen: _Tracks) -> TrackedBoxes:
+        boxes = Boxes(
+            center=seen.state[:, :3],
+            dims_lwh=seen.state[:, 3:6],
+            yaw=seen.state[:, YAW],
+            score=fused.boxes.score,
+            cls=fused.boxes.cls,
+            covariance=seen.covariance[:, _BOX, _BOX],
+            flip_log_odds=seen.flip_evidence,
+        )
+        return TrackedBoxes(
+            boxes,
+            fused.members,
+            [str(number) for number in seen.number],
+            velocity(seen.state),
+            np.sqrt(seen.covariance[:, SPEED, SPEED]),
+            1.0 / (1.0 + np.exp(-seen.existence)),
+        )
 
 
-def _advance(tracks: _Tracks, elapsed_s: float, settings: TrackSettings) -> _Tracks:
-    """Tracks ``elapsed_s`` later: constant velocity, white acceleration."""
-    F = np.eye(6)
-    F[_POSITION, _VELOCITY] = elapsed_s * np.eye(3)
-    sigma = np.array([settings.acceleration_sigma] * 2 + [settings.climb_sigma])
-    reach = np.concatenate([np.diag(0.5 * elapsed_s**2 * sigma), np.diag(elapsed_s * sigma)])
-    return _Tracks(
-        number=tracks.number,
-        state=tracks.state @ F.T,
-        covariance=F @ tracks.covariance @ F.T + reach @ reach.T,
-        dims=tracks.dims,
-        dims_covariance=tracks.dims_covariance + settings.size_drift_m**2 * elapsed_s * np.eye(3),
-        yaw=tracks.yaw,
-        yaw_variance=tracks.yaw_variance + settings.yaw_drift_rad**2 * elapsed_s,
-        flip_evidence=tracks.flip_evidence,
-        unseen_s=tracks.unseen_s + elapsed_s,
-    )
+def _born(boxes: Boxes, number: Index, age_s: float, settings: TrackSettings) -> _Tracks:
+    state, covariance = newborn(box_states(boxes), boxes.covariance, age_s, settings.motion)
+    state[:, YAW] = wrap_angle(boxes.yaw + np.where(boxes.flip_log_odds < 0, np.pi, 0.0))
+    evidence = np.minimum(np.abs(boxes.flip_log_odds), settings.max_flip_evidence)
+    return _Tracks(number, state, covariance, evidence, _seen_more(np.zeros(len(boxes)), boxes.score, settings))
 
 
-def _corrected(tracks: _Tracks, boxes: Boxes, settings: TrackSettings) -> _Tracks:
-    """Tracks after their boxes, row by row."""
-    state, covariance = _kalman(tracks.state, tracks.covariance, boxes.center, boxes.covariance[:, :3, :3])
-    dims, dims_covariance = _kalman(tracks.dims, tracks.dims_covariance, boxes.dims_lwh, boxes.covariance[:, 3:6, 3:6])
-    turn = wrap_angle(boxes.yaw - tracks.yaw)
-    flipped = np.abs(turn) > np.pi / 2
-    axis_turn = np.where(flipped, wrap_angle(turn + np.pi), turn)
-    gain = tracks.yaw_variance / (tracks.yaw_variance + boxes.covariance[:, 6, 6])
-    yaw = tracks.yaw + gain * axis_turn
+def _of_numbers(tracks: _Tracks, number: Index) -> _Tracks:
+    """The tracks with the given identities, in their order; all must be there."""
+    by_number = np.argsort(tracks.number)
+    return tracks.take(by_number[np.searchsorted(tracks.number, number, sorter=by_number)])
+
+
+def _with_names(tracks: _Tracks, names: dict[int, int]) -> _Tracks:
+    return replace(tracks, number=np.array([names.get(n, n) for n in tracks.number.tolist()], np.int64))
+
+
+def _advanced(tracks: _Tracks, elapsed_s: float, settings: TrackSettings) -> _Tracks:
+    """Tracks ``elapsed_s`` later, without those that have faded."""
+    existence = tracks.existence - settings.fade_per_s * elapsed_s
+    alive = existence > 0
+    if not alive.all():
+        tracks, existence = tracks.take(alive), existence[alive]
+    state, covariance = predicted(tracks.state, tracks.covariance, elapsed_s, settings.motion)
+    return _Tracks(tracks.number, state, covariance, tracks.flip_evidence, existence)
+
+
+def _seen_more(existence: Array, score: Array, settings: TrackSettings) -> Array:
+    """Log-odds (T,) of existence after a box of ``score`` (T,) more; a box never makes its vehicle less likely."""
+    clipped = np.clip(score, 1.0 - _MAX_SCORE, _MAX_SCORE)
+    gained = np.maximum(settings.hit_log_odds + np.log(clipped / (1.0 - clipped)), 0.2 * settings.hit_log_odds)
+    return np.minimum(existence + gained, settings.max_log_odds)
+
+
+def _fed(
+    before: _Tracks, tracks: _Tracks, fused: FusedBoxes, pairs: tuple[Index, Index], span_ns: tuple[int, int],
+    skewed: bool, settings: TrackSettings,
+) -> _Tracks:  # fmt: skip
+    """The tracks of ``pairs`` (rows of the boxes, rows of the tracks) after their boxes.
+
+    ``before`` are all tracks at the begin of the span, ``tracks`` those that live at its end. ``skewed``: cameras looked at
+    times of their own.
+    """
+    rows, columns = pairs
+    boxes, mine = fused.boxes.take(rows), tracks.take(columns)
+    if fused.parts is None or not skewed:
+        state, covariance, opposite = corrected(mine.state, mine.covariance, box_states(boxes), boxes.covariance)
+    else:
+        start = _of_numbers(before, mine.number)
+        position = np.full(len(fused.boxes), -1)
+        position[rows] = np.arange(len(rows))
+        state, covariance = _fed_in_turn(start, fused.parts, position, span_ns, settings)
+        opposite = np.cos(boxes.yaw - state[:, YAW]) < 0
+    existence = _seen_more(mine.existence, boxes.score, settings)
+    return _headed(_Tracks(mine.number, state, covariance, mine.flip_evidence, existence), opposite, boxes, settings)
+
+
+def _ages(parts: CameraParts | None, at_ns: int, settings: TrackSettings) -> tuple[float, float]:
+    """Mean age of the cameras' boxes and its spread, seconds; zero where all count as of the set's own time."""
+    times = None if parts is None else parts.captured_at_ns
+    if times is None or not len(times):
+        return 0.0, 0.0
+    ages_s = (at_ns - times) / _NS_PER_S
+    if np.abs(ages_s).max() <= settings.same_time_s:
+        return 0.0, 0.0
+    return max(float(ages_s.mean()), 0.0), float(ages_s.std())
+
+
+def _fed_in_turn(
+    start: _Tracks, parts: CameraParts, position: Index, span_ns: tuple[int, int], settings: TrackSettings
+) -> tuple[Array, Array]:
+    """States (T, 9) and covariances at the end of a span, after each camera's boxes at their own times within it.
+
+    ``position`` (M,) is the track of each fused box, -1 for none.
+    """
+    state, covariance, (now_ns, end_ns) = start.state.copy(), start.covariance.copy(), span_ns
+    times = np.full(len(parts.row), end_ns) if parts.captured_at_ns is None else parts.captured_at_ns
+    cameras, first = np.unique(parts.camera, return_index=True)
+    for row in np.argsort(times[first], kind="stable"):
+        at_ns = min(max(int(times[first[row]]), now_ns), end_ns)
+        state, covariance = predicted(state, covariance, (at_ns - now_ns) / _NS_PER_S, settings.motion)
+        now_ns = at_ns
+        own = np.flatnonzero((parts.camera == cameras[row]) & (position[parts.row] >= 0))
+        measured, at = parts.boxes.take(own), position[parts.row[own]]
+        state[at], covariance[at], _ = corrected(state[at], covariance[at], box_states(measured), measured.covariance)
+    return predicted(state, covariance, (end_ns - now_ns) / _NS_PER_S, settings.motion)
+
+
+def _headed(tracks: _Tracks, opposite: NDArray[np.bool_], boxes: Boxes, settings: TrackSettings) -> _Tracks:
+    """Tracks with their front settled: by the motion of those that drive, by the evidence gathered for the others."""
     cap = settings.max_flip_evidence
-    evidence = np.clip(tracks.flip_evidence + np.where(flipped, -1.0, 1.0) * boxes.flip_log_odds, -cap, cap)
-    reverse = evidence < 0
-    along = state[:, 3] * np.cos(yaw) + state[:, 4] * np.sin(yaw)
-    drives = _drives(state, covariance, settings)
-    reverse = np.where(drives, along < 0, reverse)
-    return _Tracks(
-        number=tracks.number,
-        state=state,
-        covariance=covariance,
-        dims=dims,
-        dims_covariance=dims_covariance,
-        yaw=wrap_angle(yaw + np.where(reverse, np.pi, 0.0)),
-        yaw_variance=(1.0 - gain) * tracks.yaw_variance,
-        flip_evidence=np.where(drives, cap, np.abs(evidence)),
-        unseen_s=np.zeros(len(boxes)),
-    )
-
-
-def _drives(state: Array, covariance: Array, settings: TrackSettings) -> NDArray[np.bool_]:
-    """Which tracks (T,) move fast enough, beyond doubt, for their velocity to tell their heading."""
-    speed = np.hypot(state[:, 3], state[:, 4])
-    sigma = np.sqrt(0.5 * (covariance[:, 3, 3] + covariance[:, 4, 4]))
-    return (speed > settings.heading_speed_mps) & (speed > settings.heading_sigmas * sigma)
-
-
-def _kalman(state: Array, covariance: Array, measured: Array, measured_covariance: Array) -> tuple[Array, Array]:
-    """Kalman update of states (T, D) by measurements (T, 3) of their first three components."""
-    seen = measured.shape[1]
-    gain = covariance[:, :, :seen] @ np.linalg.inv(covariance[:, :seen, :seen] + measured_covariance)
-    moved = state + (gain @ (measured - state[:, :seen])[..., None])[..., 0]
-    # Joseph's form: stays symmetric and positive definite for any gain.
-    keep = np.eye(state.shape[1]) - np.pad(gain, ((0, 0), (0, 0), (0, state.shape[1] - seen)))
-    left = keep @ covariance @ keep.transpose(0, 2, 1) + gain @ measured_covariance @ gain.transpose(0, 2, 1)
-    return moved, left
-
-
-def _filtered(boxes: Boxes, tracks: _Tracks) -> Boxes:
-    """The boxes with their tracks' position, size and yaw."""
-    covariance = np.zeros((len(boxes), STATE_DIM, STATE_DIM))
-    covariance[:, :3, :3] = tracks.covariance[:, _POSITION, _POSITION]
-    covariance[:, 3:6, 3:6] = tracks.dims_covariance
-    covariance[:, 6, 6] = tracks.yaw_variance
-    return Boxes(
-        center=tracks.state[:, _POSITION],
-        dims_lwh=tracks.dims,
-        yaw=tracks.yaw,
-        score=boxes.score,
-        cls=boxes.cls,
-        covariance=covariance,
-        flip_log_odds=tracks.flip_evidence,
-    )
+    evidence = np.clip(tracks.flip_evidence + np.where(opposite, -1.0, 1.0) * boxes.flip_log_odds, -cap, cap)
+    speed = tracks.state[:, SPEED]
+    sigma = np.sqrt(tracks.covariance[:, SPEED, SPEED])
+    drives = np.abs(speed) > np.maximum(settings.heading_speed_mps, settings.heading_sigmas * sigma)
+    turns = np.where(drives, speed < 0, evidence < 0)
+    state, covariance = turned_about(tracks.state, tracks.covariance, turns)
+    kept = np.where(drives, cap, np.abs(evidence))
+    return replace(tracks, state=state, covariance=covariance, flip_evidence=kept)

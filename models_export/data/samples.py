@@ -15,7 +15,7 @@ from service.errors import InputError
 from service.frames import decode
 from service.geometry.boxes import clip_extents, project_extents
 from service.geometry.camera import Camera, ray_azimuth
-from service.geometry.ground import GroundPlane
+from service.geometry.ground import Ground
 from service.geometry.transforms import Array, wrap_angle
 from service.nets.canvas import to_canvas
 
@@ -57,7 +57,7 @@ class Sample:
     """(N,) visible fraction."""
     truncated: Array
     """(N,) fraction outside the image."""
-    ground: GroundPlane
+    ground: Ground
     """The scene's road."""
     inverse_depth: NDArray[np.float32]
     """(h, w) 1 / metres at the depth net's stride; 0 where the depth is unknown."""

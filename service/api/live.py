@@ -205,5 +205,5 @@ def default_tracker() -> SiteTracker:
 def _update(tracker: SiteTracker, result: SetResult, captured_at_ns: int) -> TrackedBoxes:
     from service.fusion import FusedBoxes
 
-    fused = FusedBoxes(result.boxes, result.members, np.arange(len(result.boxes), dtype=np.int64))
+    fused = FusedBoxes(result.boxes, result.members, np.arange(len(result.boxes), dtype=np.int64), result.parts)
     return tracker.update(fused, captured_at_ns)

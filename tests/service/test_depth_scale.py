@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from service.depth_scale import DepthScale, DepthScales, cell_pixels, fit_scale, ground_inverse_depth, read_boxes
 from service.geometry.camera import Camera
-from service.geometry.ground import GroundPlane
+from service.geometry.ground import GroundGrid, GroundPlane
 from service.geometry.transforms import pole_camera_pose
 from service.nets.depth import UNBIASED, InverseDepth, ReadingError
 
@@ -33,6 +33,17 @@ def test_ground_inverse_depth_is_the_depth_of_the_ground() -> None:
     points = CAMERA.unproject(cell_pixels(SHAPE, STRIDE)[usable], 1 / inverse[usable])
     assert usable.sum() > 500
     np.testing.assert_allclose(points[:, 2], 0.0, atol=1e-9)
+
+
+def test_ground_inverse_depth_follows_a_grid() -> None:
+    axis = np.arange(-80.0, 81.0, 4.0)
+    x, y = np.meshgrid(axis, axis)
+    rolling = GroundGrid(np.array([-80.0, -80.0]), 4.0, 0.03 * x + 0.4 * np.sin(y / 20))
+    inverse = ground_inverse_depth(CAMERA, rolling, SHAPE, STRIDE)
+    usable = np.isfinite(inverse)
+    points = CAMERA.unproject(cell_pixels(SHAPE, STRIDE)[usable], 1 / inverse[usable])
+    assert usable.sum() > 300
+    np.testing.assert_allclose(points[:, 2], rolling.height_at(points), atol=0.02)
 
 
 @settings(deadline=None, max_examples=25)

@@ -10,13 +10,13 @@ from service.fusion import FusionSettings, fuse
 from service.geometry.boxes import Boxes, box_states, project_extents
 from service.geometry.camera import Camera
 from service.geometry.ground import GroundPlane
-from service.geometry.iou import iou_3d
+from service.geometry.iou import iou_3d, iou_bev
 from service.geometry.transforms import invert_rigid, pole_camera_pose, rigid, rotation_z, wrap_angle
 from service.lifting import Measurements, lift
 
 K = np.array([[642.0, 0.0, 641.5], [0.0, 642.0, 191.5], [0.0, 0.0, 1.0]])
 SIGMA_DIMS = np.array([0.2, 0.06, 0.06])
-ANYWHERE = FusionSettings(single_view_factor=1.0)
+ANYWHERE = FusionSettings(silence_ratio=1.0)
 
 
 def four_cameras(rng=None, error_deg=0.0):
@@ -213,10 +213,13 @@ def test_overlapping_vehicles_become_one_though_the_gate_kept_them_apart():
 
 def test_what_others_should_see_and_do_not_is_less_certain():
     cameras = four_cameras()
-    alone = fuse(some_boxes([car()]), np.array([0]), cameras)
-    np.testing.assert_allclose(alone.boxes.score, 0.8 * 0.85)
-    np.testing.assert_allclose(fuse(some_boxes([car()]), np.array([0]), cameras[:2]).boxes.score, 0.8)
-    np.testing.assert_allclose(fuse(some_boxes([car()] * 2), np.arange(2), cameras).boxes.score, 1 - 0.2**2)
+    odds = np.array([fuse(some_boxes([car()] * n), np.arange(n), cameras).boxes.score[0] for n in range(1, 5)])
+    odds /= 1 - odds
+    expected = 1 - 0.2 ** np.arange(1, 5)
+    np.testing.assert_allclose(odds, expected / (1 - expected) * 0.8 ** np.arange(3, -1, -1))
+    fewer = [fuse(some_boxes([car()]), np.array([0]), cameras[:n]).boxes.score[0] for n in range(1, 5)]
+    assert (np.diff(fewer) < 0).all()
+    np.testing.assert_allclose(fewer[0], 0.8)
     far_away = some_boxes([car(-60.0, -60.0)])
     np.testing.assert_allclose(fuse(far_away, np.array([0]), cameras).boxes.score, 0.8)
 
@@ -300,3 +303,49 @@ def test_mahalanobis_known_answer():
     np.testing.assert_allclose(squared, 4 / 4 + 1 / 1)
     np.testing.assert_allclose(cost, 2 + np.log(4))
     np.testing.assert_allclose(distance, np.sqrt(5))
+
+
+@given(
+    st.lists(st.tuples(st.floats(-6, 6), st.floats(-4, 4), st.floats(-3, 3), st.integers(0, 2), st.floats(0, 1)), max_size=16)
+)
+@settings(max_examples=80, deadline=None)
+def test_duplicates_are_found_as_by_looking_at_all_pairs(rows):
+    boxes = some_boxes([car(x, y, yaw) for x, y, yaw, _, _ in rows], score=[row[4] for row in rows])
+    group = np.array([row[3] for row in rows], dtype=np.int64)
+    states = box_states(boxes)
+    shared = iou_bev(states, states)
+    apart = np.linalg.norm(states[:, None, :2] - states[None, :, :2], axis=-1)
+    same = ((shared > 0.1) | (apart < 1.0)) & (group[:, None] == group[None])
+    expected, free = np.arange(len(rows)), np.ones(len(rows), dtype=bool)
+    for row in np.argsort(-boxes.score, kind="stable"):
+        if free[row]:
+            mine = free & (same[row] | (np.arange(len(rows)) == row))
+            expected[mine] = row
+            free &= ~mine
+    np.testing.assert_array_equal(best_of_duplicates(boxes, group, 0.1, 1.0), expected)
+
+
+def test_two_cameras_that_are_one_do_not_know_the_size_better():
+    boxes = some_boxes([car()] * 4)
+    one = fuse(boxes.take(np.array([0])), np.array([0]), four_cameras(), ANYWHERE).boxes
+    four = fuse(boxes, np.arange(4), four_cameras(), ANYWHERE).boxes
+    np.testing.assert_allclose(four.covariance[0, 3:6, 3:6], one.covariance[0, 3:6, 3:6])
+
+
+def test_no_cameras_see_nothing():
+    fused = fuse(Boxes.empty(), np.zeros(0, np.int64), [])
+    assert (len(fused.boxes), fused.members.shape) == (0, (0, 0))
+
+
+def test_what_each_camera_contributed_adds_up_to_the_fused_box():
+    _, boxes, camera_index, cameras, _ = crossing(np.random.default_rng(4))
+    fused = fuse(boxes, camera_index, cameras)
+    parts = fused.parts
+    information = np.linalg.inv(parts.boxes.covariance)
+    for row in range(len(fused.boxes)):
+        total = information[parts.row == row].sum(0)
+        np.testing.assert_allclose(fused.boxes.covariance[row] @ total, np.eye(7), atol=1e-6)
+        assert sorted(parts.camera[parts.row == row]) == np.flatnonzero(fused.members[row]).tolist()
+    keep = np.arange(len(fused.boxes)) % 2 == 0
+    kept = parts.of_rows(keep)
+    np.testing.assert_array_equal(np.flatnonzero(keep)[kept.row], parts.row[keep[parts.row]])

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from service.errors import FrameError
 from service.frames import EncodedFrame, FrameSet
+from service.nets.multibin import MultibinEstimates
 from service.nets.pack import load_pack
 from service.pipeline import Pipeline, PipelineSettings, SetResult
 from service.site import parse_site
@@ -108,3 +110,27 @@ def test_cameras_in_another_order_give_the_same_vehicles(pipeline: Pipeline) -> 
     assert len(forward) == len(backward)
     distance = np.linalg.norm(forward[:, None] - backward[None], axis=-1)
     assert distance.min(1).max() < 0.3
+
+
+def test_the_papers_method_runs_the_whole_way(pipeline: Pipeline) -> None:
+    paper = Pipeline(load_pack("edge"), PipelineSettings(method="paper"))
+    result, default = paper.run(frame_set(40)), pipeline.run(frame_set(40))
+    assert_well_formed(result)
+    assert result.detections == default.detections
+    assert len(result.boxes) >= 3
+    assert not np.allclose(result.per_camera[0].center, default.per_camera[0].center)
+
+
+def test_a_heading_that_is_no_number_is_an_unknown_heading(monkeypatch: pytest.MonkeyPatch, pipeline: Pipeline) -> None:
+    usual = pipeline.multibin.estimate
+
+    def lame(crops: NDArray[np.uint8], cls: NDArray[np.int64]) -> MultibinEstimates:
+        estimates = usual(crops, cls)
+        return replace(estimates, alpha=np.where(np.arange(len(cls)) % 3 == 0, np.nan, estimates.alpha))
+
+    monkeypatch.setattr(pipeline.multibin, "estimate", lame)
+    result = pipeline.run(frame_set(40))
+    assert_well_formed(result)
+    for own in result.per_camera:
+        assert np.isfinite(own.center).all()
+        assert np.isfinite(own.yaw).all()

@@ -92,6 +92,34 @@ def test_ground_is_normalised():
     np.testing.assert_allclose(ground.height_at([7.0, 8.0]), 1.5)
 
 
+GRID = {"origin_xy": [-10.0, -20.0], "cell_m": 5.0, "heights": [[0.0, 0.5, 1.0], [0.25, 0.5, 0.75]]}
+
+
+def test_ground_may_be_a_grid_of_heights_and_is_written_as_one():
+    site = parse_site(changed("ground", {"grid": GRID}))
+    assert site.ground.height_at([-5.0, -20.0]) == 0.5
+    assert site.ground.height_at([-10.0, -15.0]) == 0.25
+    assert site_document(site)["ground"] == {"grid": GRID}
+    np.testing.assert_array_equal(parse_site(site_document(site)).ground.heights, GRID["heights"])
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "field"),
+    [
+        ("heights", [[0.0, 1.0], [0.0]], "ground.grid.heights.1"),
+        ("heights", [[0.0, 1.0], [0.0, 1.0, 2.0]], "ground.grid.heights"),
+        ("heights", [[0.0] * 600] * 600, "ground.grid.heights"),
+        ("heights", [[0.0, float("inf")], [0.0, 0.0]], "ground.grid.heights.0.1"),
+        ("cell_m", 0.0, "ground.grid.cell_m"),
+        ("origin_xy", [0.0], "ground.grid.origin_xy"),
+    ],
+)
+def test_a_grid_that_cannot_be_is_refused_by_name(key, value, field):
+    with pytest.raises(CalibrationError) as caught:
+        parse_site(changed("ground", {"grid": {**GRID, key: value}}))
+    assert caught.value.field == field
+
+
 MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0]).tolist()
 SCALED = np.diag([2.0, 2.0, 2.0, 1.0]).tolist()
 
