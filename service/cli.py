@@ -160,6 +160,8 @@ def server_config(settings: Settings, app: Any) -> uvicorn.Config:
         timeout_graceful_shutdown=settings.timeout_shutdown_s,
         limit_concurrency=settings.limit_concurrency,
         ws_max_size=settings.ws_max_size,
+        # Messages of a connection that wait in memory; the next ones wait in the network.
+        ws_max_queue=4,
         # Boxes compress well, but it costs more time than a local network does.
         ws_per_message_deflate=False,
     )

@@ -13,30 +13,15 @@ from bisect import insort
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import Literal
 
 from service.frames import EncodedFrame
+from service.telemetry import Drop
 
 SyncStatus = Literal["ok", "stale", "missing"]
 
 _REMEMBERED_TIMES = 64
 """Capture times kept of each camera to recognize a frame that is sent twice."""
-
-
-class SyncDrop(StrEnum):
-    """Why a frame is in no set."""
-
-    DUPLICATE = "frame_duplicate"
-    """A frame of this camera and capture time came before."""
-    LATE = "frame_late"
-    """Its set had gone out, and no later set could use it as a stale one."""
-    CLOCK = "frame_clock"
-    """The camera's clock disagrees with those of the site's other cameras."""
-    BACKLOG = "frame_backlog"
-    """More frames of one camera were pending than may be; the oldest went."""
-    LEFT = "frame_camera_left"
-    """Its camera left, or the site ended, before its set went out."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +38,10 @@ class SyncSettings:
     """Clock and delay of a camera may differ from the site's other cameras by this; frames beyond it are dropped."""
     absent_ns: int = 2_000_000_000
     """A camera that was silent for this long is not waited for any more."""
-    max_pending: int = 16
-    """Frames of one camera that may wait."""
+    max_pending: int = 8
+    """Frames of one camera that may wait; the newest stay."""
+    max_bytes: int = 64 * 2**20
+    """Bytes of all frames that may wait; one more is dropped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,13 +80,15 @@ class _Camera:
     pending: list[_Pending] = field(default_factory=list)
     """By capture time."""
     late: EncodedFrame | None = None
+    gone: bool = False
+    """It left; its pending frames still go out, but nobody waits for more."""
     times: deque[int] = field(default_factory=lambda: deque(maxlen=_REMEMBERED_TIMES))
 
 
 class Synchronizer:
     """The frames of one site that wait for their set. Memory is bounded by ``max_pending`` frames a camera."""
 
-    def __init__(self, settings: SyncSettings, on_drop: Callable[[SyncDrop], None] = lambda _: None) -> None:
+    def __init__(self, settings: SyncSettings, on_drop: Callable[[Drop], None] = lambda _: None) -> None:
         """on_drop: told of every frame that ends in no set."""
         self._settings = settings
         self._on_drop = on_drop
@@ -107,7 +96,7 @@ class Synchronizer:
         self._offset_ns: int | None = None
         self._last: SyncedSet | None = None
         self._epoch = 0
-        self.dropped: Counter[SyncDrop] = Counter()
+        self.dropped: Counter[Drop] = Counter()
 
     @property
     def pending(self) -> int:
@@ -117,7 +106,14 @@ class Synchronizer:
     @property
     def present(self) -> frozenset[str]:
         """Cameras that sets wait for."""
-        return frozenset(self._cameras)
+        return frozenset(camera_id for camera_id, camera in self._cameras.items() if not camera.gone)
+
+    @property
+    def pending_bytes(self) -> int:
+        """Bytes of the frames that are in no set yet and not dropped."""
+        cameras = self._cameras.values()
+        late = sum(len(camera.late.data) for camera in cameras if camera.late is not None)
+        return late + sum(len(pending.frame.data) for camera in cameras for pending in camera.pending)
 
     @property
     def deadline_ns(self) -> int | None:
@@ -133,16 +129,18 @@ class Synchronizer:
             raise ValueError("a frame without a capture time cannot be grouped")
         time_ns = frame.captured_at_ns
         camera = self._cameras.setdefault(frame.camera_id, _Camera(now_ns, time_ns - now_ns))
-        camera.seen_ns = now_ns
+        camera.seen_ns, camera.gone = now_ns, False
         if time_ns in camera.times:
-            self._drop(SyncDrop.DUPLICATE)
+            self._drop(Drop.FRAME_DUPLICATE)
             return self.poll(now_ns)
         camera.times.append(time_ns)
         camera.offset_ns = time_ns - now_ns
         ready = self._follow_clocks()
         assert self._offset_ns is not None
         if abs(camera.offset_ns - self._offset_ns) > self._settings.clock_ns:
-            self._drop(SyncDrop.CLOCK)
+            self._drop(Drop.FRAME_CLOCK)
+        elif self.pending_bytes + len(frame.data) > self._settings.max_bytes:
+            self._drop(Drop.FRAME_BACKLOG)
         elif self._missed(frame.camera_id, time_ns):
             self._keep_late(camera, frame, time_ns)
         else:
@@ -151,23 +149,22 @@ class Synchronizer:
             insort(camera.pending, _Pending(time_ns, due_ns, frame), key=lambda pending: pending.captured_at_ns)
             if len(camera.pending) > self._settings.max_pending:
                 del camera.pending[0]
-                self._drop(SyncDrop.BACKLOG)
+                self._drop(Drop.FRAME_BACKLOG)
         return ready + self.poll(now_ns)
 
     def poll(self, now_ns: int) -> list[SyncedSet]:
         """The sets that are complete or whose wait has ended, in order; forgets cameras that fell silent."""
-        for camera_id, camera in list(self._cameras.items()):
-            if not camera.pending and now_ns - camera.seen_ns > self._settings.absent_ns:
-                self._forget(camera_id)
+        self._forget_absent(now_ns)
         ready = []
         while (members := self._earliest()) and self._is_ready(members, now_ns):
             ready.append(self._take(members))
+        self._forget_absent(now_ns)
         return ready
 
     def leave(self, camera_id: str, now_ns: int) -> list[SyncedSet]:
-        """A camera is gone: its pending frames are dropped and nobody waits for it. Gives the sets that this completes."""
+        """A camera is gone: its pending frames still go out, but nobody waits for more. Gives the sets that are ready."""
         if camera_id in self._cameras:
-            self._forget(camera_id)
+            self._cameras[camera_id].gone = True
         return self.poll(now_ns)
 
     def close(self) -> None:
@@ -183,7 +180,7 @@ class Synchronizer:
 
     def _is_ready(self, members: dict[str, _Pending], now_ns: int) -> bool:
         deadline_ns = self.deadline_ns
-        return len(members) == len(self._cameras) or (deadline_ns is not None and deadline_ns <= now_ns)
+        return self.present <= members.keys() or (deadline_ns is not None and deadline_ns <= now_ns)
 
     def _take(self, members: dict[str, _Pending]) -> SyncedSet:
         captured_at_ns = min(member.captured_at_ns for member in members.values())
@@ -198,7 +195,7 @@ class Synchronizer:
                 frames[camera_id] = camera.late
                 stale.add(camera_id)
             else:
-                self._drop(SyncDrop.LATE)
+                self._drop(Drop.FRAME_LATE)
             camera.late = None
         ordered = tuple(frames[camera_id] for camera_id in sorted(frames))
         self._last = SyncedSet(ordered, captured_at_ns, frozenset(stale), self._epoch)
@@ -213,7 +210,7 @@ class Synchronizer:
     def _keep_late(self, camera: _Camera, frame: EncodedFrame, time_ns: int) -> None:
         """Keep the newest late frame of a camera for the next set."""
         if camera.late is not None:
-            self._drop(SyncDrop.LATE)
+            self._drop(Drop.FRAME_LATE)
             if (camera.late.captured_at_ns or 0) > time_ns:
                 return
         camera.late = frame
@@ -237,17 +234,23 @@ class Synchronizer:
         for camera in self._cameras.values():
             if camera.late is not None:
                 camera.late = None
-                self._drop(SyncDrop.LATE)
+                self._drop(Drop.FRAME_LATE)
         if reference is not None:
             self._last = None
             self._epoch += 1
         return ready
 
+    def _forget_absent(self, now_ns: int) -> None:
+        for camera_id, camera in list(self._cameras.items()):
+            is_absent = camera.gone or now_ns - camera.seen_ns > self._settings.absent_ns
+            if is_absent and not camera.pending:
+                self._forget(camera_id)
+
     def _forget(self, camera_id: str) -> None:
         camera = self._cameras.pop(camera_id)
         for _ in range(len(camera.pending) + (camera.late is not None)):
-            self._drop(SyncDrop.LEFT)
+            self._drop(Drop.FRAME_LEFT)
 
-    def _drop(self, reason: SyncDrop) -> None:
+    def _drop(self, reason: Drop) -> None:
         self.dropped[reason] += 1
         self._on_drop(reason)

@@ -78,6 +78,9 @@ async def answer(service: Service, frame_set: FrameSet, *, per_camera: bool = Fa
         compose = partial(detections_message, frame_set, result, tracked, track_ms)
         message, encoded = await asyncio.to_thread(_compose, compose, "msgpack" in live.formats())
         statuses = [camera.status for camera in message.cameras.values()]
+        for camera in message.cameras.values():
+            if camera.skew_ms is not None:
+                service.telemetry.skew(camera.skew_ms)
         service.telemetry.frame_set(frame_set.site.id, statuses, len(message.boxes), message.timing_ms.model_dump())
         if service.settings.viewer:
             service.recent.add(frame_set)

@@ -53,6 +53,7 @@ async def put_site(site: str, request: Request, service: ServiceDep) -> Response
 async def delete_site(site: str, service: ServiceDep) -> Response:
     """Drop a site and end its streams."""
     await asyncio.to_thread(service.store.delete, site)
+    service.feeds.forget_site(site)
     service.live.forget_site(site)
     service.recent.forget_site(site)
     service.telemetry.forget_site(site)

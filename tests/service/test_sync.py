@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.frames import EncodedFrame
-from service.sync import SyncDrop, SyncedSet, Synchronizer, SyncSettings
+from service.sync import SyncedSet, Synchronizer, SyncSettings
+from service.telemetry import Drop
 
 MS = 1_000_000
 EPOCH_NS = 1_800_000_000 * 10**9
@@ -80,7 +81,7 @@ def test_a_frame_too_old_to_be_stale_is_counted_late() -> None:
     sync.push(frame("north", 233), 261 * MS)
     (ready,) = sync.poll(350 * MS)
     assert ready.status("east") == "missing"
-    assert sync.dropped[SyncDrop.LATE] == 1
+    assert sync.dropped[Drop.FRAME_LATE] == 1
 
 
 def test_a_camera_that_leaves_is_not_waited_for() -> None:
@@ -92,6 +93,26 @@ def test_a_camera_that_leaves_is_not_waited_for() -> None:
     assert ready.status("south") == "missing"
     (ready,) = [s for c in ("north", "east") for s in sync.push(frame(c, 233), 233 * MS)]
     assert len(ready.frames) == 2
+
+
+def test_what_a_camera_sent_before_it_left_still_goes_out() -> None:
+    sync = Synchronizer(SyncSettings())
+    present(sync, "north", "east")
+    sync.push(frame("north", 200), 200 * MS)
+    assert sync.leave("north", 201 * MS) == []
+    (ready,) = sync.push(frame("east", 201), 202 * MS)
+    assert len(ready.frames) == 2
+    assert sync.present == {"east"}
+    assert sync.dropped == {}
+
+
+def test_pending_bytes_are_bounded() -> None:
+    sync = Synchronizer(SyncSettings(max_bytes=25))
+    present(sync, "north", "east")
+    for i in range(4):
+        sync.push(frame("north", 200 + 33 * i, b"0123456789"), 200 * MS)
+    assert sync.pending_bytes == 20
+    assert sync.dropped == {Drop.FRAME_BACKLOG: 2}
 
 
 def test_a_silent_camera_is_not_waited_for() -> None:
@@ -110,7 +131,7 @@ def test_duplicates_are_counted() -> None:
     (ready,) = sync.push(frame("east", 200), 202 * MS)
     sync.push(frame("east", 200), 203 * MS)
     assert len(ready.frames) == 2
-    assert sync.dropped == {SyncDrop.DUPLICATE: 2}
+    assert sync.dropped == {Drop.FRAME_DUPLICATE: 2}
 
 
 @pytest.mark.parametrize("step_ms", [-3_600_000, -2_000, 2_000, 3_600_000])
@@ -125,7 +146,7 @@ def test_one_camera_whose_clock_steps_does_not_stop_the_others(step_ms: int) -> 
         sets += sync.poll(now + 32 * MS)
     sets += sync.poll(2000 * MS)
     assert [sorted(times) for _, times in shown(sets)] == [["east", "north"]] * 10
-    assert sync.dropped[SyncDrop.CLOCK] == 10
+    assert sync.dropped[Drop.FRAME_CLOCK] == 10
 
 
 @pytest.mark.parametrize("step_ms", [-3_600_000, 3_600_000])
@@ -140,7 +161,7 @@ def test_a_step_of_all_clocks_begins_an_epoch(step_ms: int) -> None:
     assert {s.epoch for s in sets} == {sets[0].epoch}
     assert sets[0].epoch >= 1
     assert [len(s.frames) for s in sets][-4:] == [3] * 4
-    assert sync.dropped[SyncDrop.CLOCK] <= 2
+    assert sync.dropped[Drop.FRAME_CLOCK] <= 2
 
 
 def test_a_clock_a_little_ahead_does_not_make_the_others_late() -> None:
@@ -152,7 +173,7 @@ def test_a_clock_a_little_ahead_does_not_make_the_others_late() -> None:
         for camera in CAMERAS:
             sets += sync.push(frame(camera, 200 + 33 * i + 200 * (camera == "south")), now)
     sets += sync.poll(5000 * MS)
-    assert sync.dropped[SyncDrop.LATE] == 0
+    assert sync.dropped[Drop.FRAME_LATE] == 0
     assert sum("north" in times and "east" in times for _, times in shown(sets)) == 20
 
 
@@ -162,7 +183,7 @@ def test_pending_frames_of_a_camera_are_bounded() -> None:
     for i in range(20):
         sync.push(frame("north", 200 + i), 200 * MS)
         assert sync.pending <= 4
-    assert sync.dropped[SyncDrop.BACKLOG] == 16
+    assert sync.dropped[Drop.FRAME_BACKLOG] == 16
 
 
 def test_a_frame_without_a_time_is_refused() -> None:
@@ -183,7 +204,7 @@ ARRIVALS = st.lists(
 
 @given(ARRIVALS)
 def test_every_frame_ends_in_one_set_or_one_counted_drop(arrivals: list[tuple[str, int, int, str]]) -> None:
-    counted: Counter[SyncDrop] = Counter()
+    counted: Counter[Drop] = Counter()
     settings = SyncSettings(max_pending=5)
     sync = Synchronizer(settings, lambda reason: counted.update([reason]))
     sets: list[SyncedSet] = []
