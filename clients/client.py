@@ -142,7 +142,7 @@ class Client:
 
     def send(self, call: Call[_T]) -> _T:
         """Send one request. Raises ServiceError."""
-        with _reaching(self._url):
+        with reaching(self._url):
             response = self._http.send(call.request(self._http))
         return call.read(response)
 
@@ -165,9 +165,9 @@ class Client:
     def stream(self, site: str) -> Iterator[Detections]:
         """Every fused message of a site, until the site is deleted or the caller stops. Raises ServiceError."""
         with (
-            _reaching(self._url),
+            reaching(self._url),
             websockets.sync.client.connect(
-                _stream_url(self._url, site), open_timeout=self._timeouts.connect_s, max_size=MAX_MESSAGE_BYTES
+                socket_url(self._url, "stream", site), open_timeout=self._timeouts.connect_s, max_size=MAX_MESSAGE_BYTES
             ) as socket,
         ):
             for text in socket:
@@ -196,7 +196,7 @@ class AsyncClient:
 
     async def send(self, call: Call[_T]) -> _T:
         """Send one request. Raises ServiceError."""
-        with _reaching(self._url):
+        with reaching(self._url):
             response = await self._http.send(call.request(self._http))
         return call.read(response)
 
@@ -220,9 +220,9 @@ class AsyncClient:
 
     async def stream(self, site: str) -> AsyncIterator[Detections]:
         """As :meth:`Client.stream`."""
-        with _reaching(self._url):
+        with reaching(self._url):
             async with websockets.asyncio.client.connect(
-                _stream_url(self._url, site), open_timeout=self._timeouts.connect_s, max_size=MAX_MESSAGE_BYTES
+                socket_url(self._url, "stream", site), open_timeout=self._timeouts.connect_s, max_size=MAX_MESSAGE_BYTES
             ) as socket:
                 async for text in socket:
                     yield Detections.model_validate_json(text)
@@ -241,7 +241,7 @@ class AsyncClient:
 
 
 @contextmanager
-def _reaching(url: str) -> Iterator[None]:
+def reaching(url: str) -> Iterator[None]:
     """Turn what the transports raise into ServiceError."""
     try:
         yield
@@ -283,10 +283,11 @@ def _site_path(site: str) -> str:
     return f"/sites/{quote(site, safe='')}"
 
 
-def _stream_url(url: str, site: str) -> str:
+def socket_url(url: str, room: str, site: str) -> str:
+    """Address of a site's WebSocket: ``room`` is ``stream`` or ``ingest``; url is the service's root."""
     root = httpx.URL(url)
     scheme = {"http": "ws", "https": "wss"}[root.scheme]
-    return f"{root.copy_with(scheme=scheme)}".rstrip("/") + f"/stream/{quote(site, safe='')}"
+    return f"{root.copy_with(scheme=scheme)}".rstrip("/") + f"/{room}/{quote(site, safe='')}"
 
 
 def _timeout(timeouts: Timeouts) -> httpx.Timeout:

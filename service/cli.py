@@ -28,6 +28,7 @@ COMMAND_GROUP = "quadlift.commands"
 _EXTRA_BY_PACKAGE = {"clients": "clients", "models_export": "train"}
 _HELP = {
     "demo": "Show a live four-camera intersection in the browser.",
+    "feed": "Push recordings or live cameras to a running service.",
     "scenes": "Render simulated scenes for training and tests.",
     "train": "Train the networks.",
     "export": "Export trained networks to an ONNX pack.",
