@@ -134,11 +134,15 @@ class Client:
     """Talks to a service from plain code. Not for use by several threads at once."""
 
     def __init__(
-        self, url: str = DEFAULT_URL, timeouts: Timeouts = Timeouts(), transport: httpx.BaseTransport | None = None
+        self,
+        url: str = DEFAULT_URL,
+        timeouts: Timeouts = Timeouts(),
+        transport: httpx.BaseTransport | None = None,
+        token: str | None = None,
     ) -> None:
-        """url: the service's root. transport: another way to the service, for tests."""
-        self._url, self._timeouts = url, timeouts
-        self._http = httpx.Client(base_url=url, timeout=_timeout(timeouts), transport=transport)
+        """url: the service's root. transport: another way to the service, for tests. token: where the service wants one."""
+        self._url, self._timeouts, self._headers = url, timeouts, bearer(token)
+        self._http = httpx.Client(base_url=url, timeout=_timeout(timeouts), transport=transport, headers=self._headers)
 
     def send(self, call: Call[_T]) -> _T:
         """Send one request. Raises ServiceError."""
@@ -167,7 +171,10 @@ class Client:
         with (
             reaching(self._url),
             websockets.sync.client.connect(
-                socket_url(self._url, "stream", site), open_timeout=self._timeouts.connect_s, max_size=MAX_MESSAGE_BYTES
+                socket_url(self._url, "stream", site),
+                open_timeout=self._timeouts.connect_s,
+                max_size=MAX_MESSAGE_BYTES,
+                additional_headers=self._headers,
             ) as socket,
         ):
             for text in socket:
@@ -188,11 +195,15 @@ class AsyncClient:
     """Talks to a service from asyncio code; the methods are those of :class:`Client`."""
 
     def __init__(
-        self, url: str = DEFAULT_URL, timeouts: Timeouts = Timeouts(), transport: httpx.AsyncBaseTransport | None = None
+        self,
+        url: str = DEFAULT_URL,
+        timeouts: Timeouts = Timeouts(),
+        transport: httpx.AsyncBaseTransport | None = None,
+        token: str | None = None,
     ) -> None:
-        """url: the service's root. transport: another way to the service, for tests."""
-        self._url, self._timeouts = url, timeouts
-        self._http = httpx.AsyncClient(base_url=url, timeout=_timeout(timeouts), transport=transport)
+        """url: the service's root. transport: another way to the service, for tests. token: where the service wants one."""
+        self._url, self._timeouts, self._headers = url, timeouts, bearer(token)
+        self._http = httpx.AsyncClient(base_url=url, timeout=_timeout(timeouts), transport=transport, headers=self._headers)
 
     async def send(self, call: Call[_T]) -> _T:
         """Send one request. Raises ServiceError."""
@@ -222,7 +233,10 @@ class AsyncClient:
         """As :meth:`Client.stream`."""
         with reaching(self._url):
             async with websockets.asyncio.client.connect(
-                socket_url(self._url, "stream", site), open_timeout=self._timeouts.connect_s, max_size=MAX_MESSAGE_BYTES
+                socket_url(self._url, "stream", site),
+                open_timeout=self._timeouts.connect_s,
+                max_size=MAX_MESSAGE_BYTES,
+                additional_headers=self._headers,
             ) as socket:
                 async for text in socket:
                     yield Detections.model_validate_json(text)
@@ -288,6 +302,11 @@ def socket_url(url: str, room: str, site: str) -> str:
     root = httpx.URL(url)
     scheme = {"http": "ws", "https": "wss"}[root.scheme]
     return f"{root.copy_with(scheme=scheme)}".rstrip("/") + f"/{room}/{quote(site, safe='')}"
+
+
+def bearer(token: str | None) -> dict[str, str]:
+    """The header that carries a token."""
+    return {"Authorization": f"Bearer {token}"} if token else {}
 
 
 def _timeout(timeouts: Timeouts) -> httpx.Timeout:

@@ -52,6 +52,8 @@ class FeedPlan:
     """Frames a second of recordings; None: their own, or ten."""
     loop: bool = False
     """Begin recordings again when they end."""
+    token: str | None = None
+    """Where the service wants one, with the scope ``ingest``."""
 
 
 async def feed_all(plan: FeedPlan, fed: dict[str, Fed]) -> None:
@@ -118,7 +120,7 @@ class _Feeder:
         """The connection; None while the service cannot be reached. Raises ServiceError when it will never take us."""
         if self._client is not None or time.monotonic() < self._retry_at:
             return self._client
-        client = IngestClient(self._plan.url, self._plan.site)
+        client = IngestClient(self._plan.url, self._plan.site, token=self._plan.token)
         try:
             await client.open()
         except ServiceError as error:
@@ -159,10 +161,11 @@ def feed(
     rate: Annotated[float | None, typer.Option(min=0.1, max=240, help="Frames a second of recordings.")] = None,
     loop: Annotated[bool, typer.Option(help="Begin recordings again when they end.")] = False,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="Stop after this time.")] = None,
+    token: Annotated[str | None, typer.Option(envvar="QUADLIFT_TOKEN", help="Bearer token; better in the environment.")] = None,
 ) -> None:
     """Push frames of a site's cameras to a running service; Ctrl-C stops."""
     try:
-        plan = FeedPlan(url, site, parse_cameras(cameras), rate, loop)
+        plan = FeedPlan(url, site, parse_cameras(cameras), rate, loop, token)
         fed = {camera: Fed() for camera in plan.sources}
         asyncio.run(_run(plan, fed, seconds))
     except* (SourceError, ServiceError) as group:

@@ -17,7 +17,7 @@ import websockets.asyncio.client
 from pydantic import ValidationError
 from websockets.exceptions import ConnectionClosed
 
-from clients.client import DEFAULT_URL, MAX_MESSAGE_BYTES, Timeouts, reaching, socket_url
+from clients.client import DEFAULT_URL, MAX_MESSAGE_BYTES, Timeouts, bearer, reaching, socket_url
 from service.schemas import ErrorDetail, ErrorMessage, IngestHeader, rfc3339_from_ns
 
 _LENGTH = struct.Struct(">I")
@@ -36,8 +36,11 @@ def ingest_message(camera: str, data: bytes, captured_at_ns: int, sequence: int)
 class IngestClient:
     """One connection that brings frames of one or more of a site's cameras. For use by one task at a time."""
 
-    def __init__(self, url: str = DEFAULT_URL, site: str = "demo", timeouts: Timeouts = _TIMEOUTS) -> None:
-        """url: the service's root."""
+    def __init__(
+        self, url: str = DEFAULT_URL, site: str = "demo", timeouts: Timeouts = _TIMEOUTS, token: str | None = None
+    ) -> None:
+        """url: the service's root. token: where the service wants one."""
+        self._headers = bearer(token)
         self._url, self._site, self._timeouts = url, site, timeouts
         self._socket: websockets.asyncio.client.ClientConnection | None = None
         self._listening: asyncio.Task[None] | None = None
@@ -56,6 +59,7 @@ class IngestClient:
                 close_timeout=self._timeouts.connect_s,
                 max_size=MAX_MESSAGE_BYTES,
                 compression=None,
+                additional_headers=self._headers,
             )
         self._listening = asyncio.create_task(self._listen(self._socket))
 

@@ -140,11 +140,12 @@ def _run(settings: Settings) -> None:
         # Both are checked here, before the server starts, so that a bad file ends in one clear line.
         open_store(settings)
         pipeline = default_pipeline(settings)
+        server = uvicorn.Server(server_config(settings, create_app(settings, lambda _: pipeline)))
     except OSError as error:
         raise _fail(f"data_dir: {error}. Give a folder that can be written.") from None
     except QuadliftError as error:
         raise _fail(str(error)) from None
-    uvicorn.Server(server_config(settings, create_app(settings, lambda _: pipeline))).run()
+    server.run()
 
 
 def server_config(settings: Settings, app: Any) -> uvicorn.Config:
@@ -163,6 +164,8 @@ def server_config(settings: Settings, app: Any) -> uvicorn.Config:
         ws_max_size=settings.ws_max_size,
         # Messages of a connection that wait in memory; the next ones wait in the network.
         ws_max_queue=4,
+        ssl_certfile=settings.tls_cert,
+        ssl_keyfile=settings.tls_key,
         # Boxes compress well, but it costs more time than a local network does.
         ws_per_message_deflate=False,
     )

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, SecretStr
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.frames import FrameLimits
@@ -34,7 +34,7 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="QUADLIFT_", frozen=True, use_attribute_docstrings=True)
 
     host: str = "127.0.0.1"
-    """Address to listen on; ``0.0.0.0`` for all. The service has no log-in of its own: put a proxy before a public one."""
+    """Address to listen on; ``0.0.0.0`` for all. Give tokens, or put a proxy before a public one."""
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
     """TCP port to listen on; 0 takes a free one."""
     pack: str = "edge"
@@ -65,6 +65,18 @@ class Settings(BaseSettings):
     """Sites of one service."""
     max_readers: Annotated[int, Field(ge=1)] = 64
     """Stream subscribers of one site."""
+
+    tokens: SecretStr | None = None
+    """Bearer tokens, one a line or separated by ``;``: scopes (ingest, read, admin; by comma), a blank, the token. With any,
+    requests need one. Unset, here and in ``tokens_file``: all is open."""
+    tokens_file: Path | None = None
+    """File with more tokens, in the same form; ``#`` begins a comment."""
+    allowed_origins: tuple[str, ...] = ()
+    """Origins whose pages may open WebSockets, beside the service's own, as a JSON list; ``*`` for any."""
+    tls_cert: Path | None = None
+    """Certificate chain (PEM) to serve HTTPS with; needs ``tls_key``."""
+    tls_key: Path | None = None
+    """Private key (PEM) of the certificate."""
 
     ingest_max_connections: Annotated[int, Field(ge=1)] = 32
     """Camera stream connections of one site."""

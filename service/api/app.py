@@ -10,6 +10,7 @@ from fastapi import FastAPI
 
 from service import __version__
 from service.api import detect, health, ingest, sites, stream, viewer
+from service.api.auth import Access, load_tokens
 from service.api.errors import install_error_handlers
 from service.api.feeds import Feed, Feeds
 from service.api.guard import Guard
@@ -39,9 +40,10 @@ def create_app(
 ) -> FastAPI:
     """Build the app. Its lifespan loads the sites and the pack, then warms up while ``/health/live`` answers already.
 
-    The factories are seams for tests and for pipelines that are loaded before.
+    The factories are seams for tests and for pipelines that are loaded before. Raises InputError for unusable tokens.
     """
     telemetry = Telemetry()
+    tokens = load_tokens(settings)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -80,6 +82,8 @@ def create_app(
             await warming
 
     app = FastAPI(title="Quadlift", version=__version__, description=_DESCRIPTION, lifespan=lifespan, redoc_url=None)
+    app.add_middleware(Access, tokens=tokens, allowed_origins=settings.allowed_origins)
+    # The one added last is the outermost: refusals are counted too.
     app.add_middleware(Guard, telemetry=telemetry)
     install_error_handlers(app)
     for room in (detect, sites, stream, ingest, health):

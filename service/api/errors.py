@@ -11,7 +11,7 @@ from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
-from service.errors import InputError, OverloadError, QuadliftError
+from service.errors import InputError, OverloadError, QuadliftError, UnauthorizedError
 from service.schemas import ErrorDetail, ErrorMessage
 
 INTERNAL = QuadliftError("something went wrong inside the service.", remedy="The service's log says what.")
@@ -26,7 +26,11 @@ _REMEDIES = {
 
 def error_response(error: QuadliftError) -> Response:
     """The answer for an error of the service's own tree."""
-    headers = {"Retry-After": str(error.retry_after_s)} if isinstance(error, OverloadError) else {}
+    headers = {}
+    if isinstance(error, OverloadError):
+        headers["Retry-After"] = str(error.retry_after_s)
+    if isinstance(error, UnauthorizedError):
+        headers["WWW-Authenticate"] = "Bearer"
     return _response(error.status, _detail(error), headers)
 
 
