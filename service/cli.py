@@ -136,6 +136,10 @@ def _run(settings: Settings) -> None:
 
     from service.api.app import create_app, default_pipeline, open_store
 
+    for name in ("tls_cert", "tls_key"):
+        path, other = getattr(settings, name), settings.tls_key or settings.tls_cert
+        if (path is None) != (other is None) or (path is not None and not path.is_file()):
+            raise _fail(f"{name}: {path or 'not given'}. TLS needs a certificate and its key, both as files.")
     try:
         # Both are checked here, before the server starts, so that a bad file ends in one clear line.
         open_store(settings)
@@ -161,7 +165,8 @@ def server_config(settings: Settings, app: Any) -> uvicorn.Config:
         timeout_keep_alive=settings.timeout_keep_alive_s,
         timeout_graceful_shutdown=settings.timeout_shutdown_s,
         limit_concurrency=settings.limit_concurrency,
-        ws_max_size=settings.ws_max_size,
+        # Only camera streams send large messages: one frame and its header.
+        ws_max_size=min(settings.ws_max_size, settings.max_frame_bytes + settings.ingest_max_header_bytes + 4),
         # Messages of a connection that wait in memory; the next ones wait in the network.
         ws_max_queue=4,
         ssl_certfile=settings.tls_cert,

@@ -4,6 +4,7 @@
     |-- InputError (422)            a value that the caller can mend
     |   |-- FrameError (422)        not an image, truncated, wrong size
     |   |-- TooLargeError (413)     more bytes, pixels or parts than the limits allow
+    |   |-- SlowSenderError (408)   a body that does not come in time
     |   |-- CalibrationError (422)  camera, ground plane or site that cannot be used
     |   |-- NotFoundError (404)     unknown site, camera or frame
     |   |-- UnauthorizedError (401) no token, or an unknown one
@@ -54,6 +55,13 @@ class TooLargeError(InputError):
 
     status = 413
     code = "too_large"
+
+
+class SlowSenderError(InputError):
+    """A request's body did not come in time."""
+
+    status = 408
+    code = "too_slow"
 
 
 class CalibrationError(InputError):

@@ -55,6 +55,8 @@ class Settings(BaseSettings):
 
     max_body_bytes: Annotated[int, Field(ge=1024)] = 32 * 2**20
     """Bytes of one request's body."""
+    body_receive_s: Annotated[float, Field(gt=0)] = 10.0
+    """A request's body that has not come after this time is answered 408. Seconds."""
     max_frame_bytes: Annotated[int, Field(ge=1024)] = FrameLimits.max_frame_bytes
     """Bytes of one frame's file."""
     max_pixels: Annotated[int, Field(ge=256)] = FrameLimits.max_pixels
