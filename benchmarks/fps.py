@@ -43,6 +43,7 @@ class Via(StrEnum):
 
     INPROC = "inproc"
     HTTP = "http"
+    WS = "ws"
 
 
 def run_inproc(scheduler: Scheduler, sets: Iterator[FrameSet], seconds: float, in_flight: int, into: Measured) -> None:
@@ -81,12 +82,14 @@ def measure(pack: str, sets: Sequence[FrameSet], seconds: float, via: Via, worke
 def _way(
     pack: str, pipeline: Pipeline, sets: Sequence[FrameSet], via: Via, workers: int
 ) -> Iterator[Callable[[float, Measured], None]]:
-    if via is Via.HTTP:
+    if via is not Via.INPROC:
         # Needs the extra `clients`; the way in process does not.
         from benchmarks.served import run_http, served
+        from benchmarks.streamed import run_ws
 
+        run = run_ws if via is Via.WS else run_http
         with served(pack, sets[0].site, workers) as url:
-            yield lambda seconds, into: run_http(url, sets, seconds, workers + 1, into)
+            yield lambda seconds, into: run(url, sets, seconds, workers + 1, into)
         return
     scheduler = Scheduler(pipeline, workers=workers)
     endless = itertools.cycle(sets)
@@ -142,7 +145,9 @@ def bench_fps(
     cameras: Annotated[int | None, typer.Option(min=1, help="Use only the first cameras.")] = None,
     seconds: Annotated[float, typer.Option(min=0.5, help="Time of the measurement, the bare loop aside.")] = 10.0,
     pack: Annotated[str, typer.Option(help="Pack: a shipped one's name, or a folder.")] = "edge",
-    via: Annotated[Via, typer.Option(help="In process, or through a served process on loopback.")] = Via.INPROC,
+    via: Annotated[
+        Via, typer.Option(help="In process, or through a served process on loopback: POST or streams.")
+    ] = Via.INPROC,
     target: Annotated[float, typer.Option(help="Exit with 1 below this many sets a second.")] = 30.0,
     workers: Annotated[int | None, typer.Option(min=1, help="Worker threads; the usable cores if left out.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,

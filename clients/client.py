@@ -134,15 +134,19 @@ class Client:
     """Talks to a service from plain code. Not for use by several threads at once."""
 
     def __init__(
-        self, url: str = DEFAULT_URL, timeouts: Timeouts = Timeouts(), transport: httpx.BaseTransport | None = None
+        self,
+        url: str = DEFAULT_URL,
+        timeouts: Timeouts = Timeouts(),
+        transport: httpx.BaseTransport | None = None,
+        token: str | None = None,
     ) -> None:
-        """url: the service's root. transport: another way to the service, for tests."""
-        self._url, self._timeouts = url, timeouts
-        self._http = httpx.Client(base_url=url, timeout=_timeout(timeouts), transport=transport)
+        """url: the service's root. transport: another way to the service, for tests. token: where the service wants one."""
+        self._url, self._timeouts, self._headers = url, timeouts, bearer(token)
+        self._http = httpx.Client(base_url=url, timeout=_timeout(timeouts), transport=transport, headers=self._headers)
 
     def send(self, call: Call[_T]) -> _T:
         """Send one request. Raises ServiceError."""
-        with _reaching(self._url):
+        with reaching(self._url):
             response = self._http.send(call.request(self._http))
         return call.read(response)
 
@@ -165,9 +169,12 @@ class Client:
     def stream(self, site: str) -> Iterator[Detections]:
         """Every fused message of a site, until the site is deleted or the caller stops. Raises ServiceError."""
         with (
-            _reaching(self._url),
+            reaching(self._url),
             websockets.sync.client.connect(
-                _stream_url(self._url, site), open_timeout=self._timeouts.connect_s, max_size=MAX_MESSAGE_BYTES
+                socket_url(self._url, "stream", site),
+                open_timeout=self._timeouts.connect_s,
+                max_size=MAX_MESSAGE_BYTES,
+                additional_headers=self._headers,
             ) as socket,
         ):
             for text in socket:
@@ -188,15 +195,19 @@ class AsyncClient:
     """Talks to a service from asyncio code; the methods are those of :class:`Client`."""
 
     def __init__(
-        self, url: str = DEFAULT_URL, timeouts: Timeouts = Timeouts(), transport: httpx.AsyncBaseTransport | None = None
+        self,
+        url: str = DEFAULT_URL,
+        timeouts: Timeouts = Timeouts(),
+        transport: httpx.AsyncBaseTransport | None = None,
+        token: str | None = None,
     ) -> None:
-        """url: the service's root. transport: another way to the service, for tests."""
-        self._url, self._timeouts = url, timeouts
-        self._http = httpx.AsyncClient(base_url=url, timeout=_timeout(timeouts), transport=transport)
+        """url: the service's root. transport: another way to the service, for tests. token: where the service wants one."""
+        self._url, self._timeouts, self._headers = url, timeouts, bearer(token)
+        self._http = httpx.AsyncClient(base_url=url, timeout=_timeout(timeouts), transport=transport, headers=self._headers)
 
     async def send(self, call: Call[_T]) -> _T:
         """Send one request. Raises ServiceError."""
-        with _reaching(self._url):
+        with reaching(self._url):
             response = await self._http.send(call.request(self._http))
         return call.read(response)
 
@@ -220,9 +231,12 @@ class AsyncClient:
 
     async def stream(self, site: str) -> AsyncIterator[Detections]:
         """As :meth:`Client.stream`."""
-        with _reaching(self._url):
+        with reaching(self._url):
             async with websockets.asyncio.client.connect(
-                _stream_url(self._url, site), open_timeout=self._timeouts.connect_s, max_size=MAX_MESSAGE_BYTES
+                socket_url(self._url, "stream", site),
+                open_timeout=self._timeouts.connect_s,
+                max_size=MAX_MESSAGE_BYTES,
+                additional_headers=self._headers,
             ) as socket:
                 async for text in socket:
                     yield Detections.model_validate_json(text)
@@ -241,7 +255,7 @@ class AsyncClient:
 
 
 @contextmanager
-def _reaching(url: str) -> Iterator[None]:
+def reaching(url: str) -> Iterator[None]:
     """Turn what the transports raise into ServiceError."""
     try:
         yield
@@ -283,10 +297,16 @@ def _site_path(site: str) -> str:
     return f"/sites/{quote(site, safe='')}"
 
 
-def _stream_url(url: str, site: str) -> str:
+def socket_url(url: str, room: str, site: str) -> str:
+    """Address of a site's WebSocket: ``room`` is ``stream`` or ``ingest``; url is the service's root."""
     root = httpx.URL(url)
     scheme = {"http": "ws", "https": "wss"}[root.scheme]
-    return f"{root.copy_with(scheme=scheme)}".rstrip("/") + f"/stream/{quote(site, safe='')}"
+    return f"{root.copy_with(scheme=scheme)}".rstrip("/") + f"/{room}/{quote(site, safe='')}"
+
+
+def bearer(token: str | None) -> dict[str, str]:
+    """The header that carries a token."""
+    return {"Authorization": f"Bearer {token}"} if token else {}
 
 
 def _timeout(timeouts: Timeouts) -> httpx.Timeout:

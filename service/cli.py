@@ -28,6 +28,7 @@ COMMAND_GROUP = "quadlift.commands"
 _EXTRA_BY_PACKAGE = {"clients": "clients", "models_export": "train"}
 _HELP = {
     "demo": "Show a live four-camera intersection in the browser.",
+    "feed": "Push recordings or live cameras to a running service.",
     "scenes": "Render simulated scenes for training and tests.",
     "train": "Train the networks.",
     "export": "Export trained networks to an ONNX pack.",
@@ -135,15 +136,20 @@ def _run(settings: Settings) -> None:
 
     from service.api.app import create_app, default_pipeline, open_store
 
+    for name in ("tls_cert", "tls_key"):
+        path, other = getattr(settings, name), settings.tls_key or settings.tls_cert
+        if (path is None) != (other is None) or (path is not None and not path.is_file()):
+            raise _fail(f"{name}: {path or 'not given'}. TLS needs a certificate and its key, both as files.")
     try:
         # Both are checked here, before the server starts, so that a bad file ends in one clear line.
         open_store(settings)
         pipeline = default_pipeline(settings)
+        server = uvicorn.Server(server_config(settings, create_app(settings, lambda _: pipeline)))
     except OSError as error:
         raise _fail(f"data_dir: {error}. Give a folder that can be written.") from None
     except QuadliftError as error:
         raise _fail(str(error)) from None
-    uvicorn.Server(server_config(settings, create_app(settings, lambda _: pipeline))).run()
+    server.run()
 
 
 def server_config(settings: Settings, app: Any) -> uvicorn.Config:
@@ -159,7 +165,12 @@ def server_config(settings: Settings, app: Any) -> uvicorn.Config:
         timeout_keep_alive=settings.timeout_keep_alive_s,
         timeout_graceful_shutdown=settings.timeout_shutdown_s,
         limit_concurrency=settings.limit_concurrency,
-        ws_max_size=settings.ws_max_size,
+        # Only camera streams send large messages: one frame and its header.
+        ws_max_size=min(settings.ws_max_size, settings.max_frame_bytes + settings.ingest_max_header_bytes + 4),
+        # Messages of a connection that wait in memory; the next ones wait in the network.
+        ws_max_queue=4,
+        ssl_certfile=settings.tls_cert,
+        ssl_keyfile=settings.tls_key,
         # Boxes compress well, but it costs more time than a local network does.
         ws_per_message_deflate=False,
     )

@@ -4,8 +4,11 @@
     |-- InputError (422)            a value that the caller can mend
     |   |-- FrameError (422)        not an image, truncated, wrong size
     |   |-- TooLargeError (413)     more bytes, pixels or parts than the limits allow
+    |   |-- SlowSenderError (408)   a body that does not come in time
     |   |-- CalibrationError (422)  camera, ground plane or site that cannot be used
-    |   `-- NotFoundError (404)     unknown site, camera or frame
+    |   |-- NotFoundError (404)     unknown site, camera or frame
+    |   |-- UnauthorizedError (401) no token, or an unknown one
+    |   `-- ForbiddenError (403)    a token without the scope, a page of a foreign origin
     |-- OverloadError (503)         busy or starting; Retry-After says when to come back
     `-- PackError (500)             a pack that is missing, damaged or not what its manifest says
 
@@ -54,6 +57,13 @@ class TooLargeError(InputError):
     code = "too_large"
 
 
+class SlowSenderError(InputError):
+    """A request's body did not come in time."""
+
+    status = 408
+    code = "too_slow"
+
+
 class CalibrationError(InputError):
     """A camera, a ground plane or a whole site cannot be used for geometry."""
 
@@ -65,6 +75,20 @@ class NotFoundError(InputError):
 
     status = 404
     code = "not_found"
+
+
+class UnauthorizedError(InputError):
+    """The service wants a token, and none that it knows was sent."""
+
+    status = 401
+    code = "unauthorized"
+
+
+class ForbiddenError(InputError):
+    """The sender is known, or names its origin, and may not do this."""
+
+    status = 403
+    code = "forbidden"
 
 
 class OverloadError(QuadliftError):

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 import cv2
@@ -47,6 +48,15 @@ class EncodedFrame:
     """Capture time in nanoseconds since 1970 (UTC), or None when the sender gave none for this camera."""
 
 
+@dataclass(frozen=True)
+class RefusedFrame:
+    """A camera's frame that :func:`check_frame` refused."""
+
+    captured_at_ns: int
+    """Nanoseconds since 1970 (UTC)."""
+    reason: str
+
+
 @dataclass(frozen=True, eq=False)
 class FrameSet:
     """What a site's cameras saw at one moment: one frame of each camera that delivered, 1..N."""
@@ -57,6 +67,10 @@ class FrameSet:
     """The set's capture time, nanoseconds since 1970 (UTC)."""
     sequence: int
     """Counts a site's sets from 1."""
+    stale: frozenset[str] = frozenset()
+    """Cameras whose frame is of an earlier moment and stands in for one that did not come in time."""
+    refused: Mapping[str, RefusedFrame] = field(default_factory=dict)
+    """What cameras without a frame in this set sent instead, by camera id."""
 
 
 @dataclass(frozen=True)

@@ -58,8 +58,9 @@ class Box(_Message):
 class CameraStatus(_Message):
     """What one camera of the site gave to a frame set."""
 
-    status: Literal["ok", "missing", "bad"]
-    """``missing``: no frame came. ``bad``: it could not be decoded; ``message`` says why."""
+    status: Literal["ok", "stale", "missing", "bad"]
+    """``stale``: an earlier frame stands in for one that did not come in time. ``missing``: no frame came. ``bad``: it could
+    not be used; ``message`` says why."""
     captured_at: str | None = None
     """RFC 3339, UTC."""
     skew_ms: Finite | None = None
@@ -80,6 +81,17 @@ class Timing(_Message):
     fuse: Finite
     track: Finite
     total: Finite
+
+
+class IngestHeader(_Message):
+    """What a camera's frame says of itself in a message of ``WS /ingest/{site}``."""
+
+    camera: Annotated[str, Field(min_length=1, max_length=64)]
+    """The camera's id."""
+    captured_at: Annotated[str, Field(max_length=64)]
+    """RFC 3339 with a zone."""
+    sequence: Annotated[int, Field(ge=0, le=2**63 - 1, strict=True)]
+    """Counts the camera's frames."""
 
 
 class Detections(_Message):

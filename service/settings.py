@@ -6,10 +6,11 @@ import os
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, SecretStr
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.frames import FrameLimits
+from service.sync import SyncSettings
 
 _CGROUP_CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
 
@@ -33,7 +34,7 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="QUADLIFT_", frozen=True, use_attribute_docstrings=True)
 
     host: str = "127.0.0.1"
-    """Address to listen on; ``0.0.0.0`` for all. The service has no log-in of its own: put a proxy before a public one."""
+    """Address to listen on; ``0.0.0.0`` for all. Give tokens, or put a proxy before a public one."""
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
     """TCP port to listen on; 0 takes a free one."""
     pack: str = "edge"
@@ -54,6 +55,8 @@ class Settings(BaseSettings):
 
     max_body_bytes: Annotated[int, Field(ge=1024)] = 32 * 2**20
     """Bytes of one request's body."""
+    body_receive_s: Annotated[float, Field(gt=0)] = 10.0
+    """A request's body that has not come after this time is answered 408. Seconds."""
     max_frame_bytes: Annotated[int, Field(ge=1024)] = FrameLimits.max_frame_bytes
     """Bytes of one frame's file."""
     max_pixels: Annotated[int, Field(ge=256)] = FrameLimits.max_pixels
@@ -64,6 +67,41 @@ class Settings(BaseSettings):
     """Sites of one service."""
     max_readers: Annotated[int, Field(ge=1)] = 64
     """Stream subscribers of one site."""
+
+    tokens: SecretStr | None = None
+    """Bearer tokens, one a line or separated by ``;``: scopes (ingest, read, admin; by comma), a blank, the token. With any,
+    requests need one. Unset, here and in ``tokens_file``: all is open."""
+    tokens_file: Path | None = None
+    """File with more tokens, in the same form; ``#`` begins a comment."""
+    allowed_origins: tuple[str, ...] = ()
+    """Origins whose pages may open WebSockets, beside the service's own, as a JSON list; ``*`` for any."""
+    tls_cert: Path | None = None
+    """Certificate chain (PEM) to serve HTTPS with; needs ``tls_key``."""
+    tls_key: Path | None = None
+    """Private key (PEM) of the certificate."""
+
+    ingest_max_connections: Annotated[int, Field(ge=1)] = 32
+    """Camera stream connections of one site."""
+    ingest_max_header_bytes: Annotated[int, Field(ge=128)] = 1024
+    """Bytes of the JSON header before a frame on a camera stream."""
+    ingest_receive_s: Annotated[float, Field(gt=0)] = 10.0
+    """A camera stream that brings no whole message for this long is closed. Seconds."""
+    ingest_max_errors: Annotated[int, Field(ge=1)] = 32
+    """A camera stream is closed when this many of its messages in a row are refused."""
+    sync_tolerance_ms: Annotated[float, Field(ge=0)] = 20.0
+    """Capture times within one frame set differ by at most this; below the time between two frames of a camera."""
+    sync_wait_ms: Annotated[float, Field(ge=0)] = 50.0
+    """How long a frame set waits for cameras that have not delivered. Milliseconds."""
+    sync_stale_ms: Annotated[float, Field(ge=0)] = 50.0
+    """A frame that missed its set may stand in for its camera in a set captured at most this much later; 0: never."""
+    sync_clock_ms: Annotated[float, Field(gt=0)] = 250.0
+    """Frames of a camera whose clock and delay differ from the others' by more than this are dropped. Milliseconds."""
+    sync_absent_ms: Annotated[float, Field(gt=0)] = 2000.0
+    """A camera that is silent for this long is not waited for. Milliseconds."""
+    sync_max_pending: Annotated[int, Field(ge=1)] = 8
+    """Frames of one camera that may wait for their set."""
+    sync_max_bytes: Annotated[int, Field(ge=1024)] = 64 * 2**20
+    """Bytes of one site's frames that may wait for their set."""
 
     viewer: bool = True
     """Serve the viewer page at ``/`` and the newest frames that it shows."""
@@ -86,3 +124,16 @@ class Settings(BaseSettings):
     def frame_limits(self) -> FrameLimits:
         """The limits that apply to a single frame."""
         return FrameLimits(self.max_frame_bytes, self.max_pixels)
+
+    @property
+    def sync(self) -> SyncSettings:
+        """How camera streams are grouped into frame sets."""
+        return SyncSettings(
+            tolerance_ns=round(self.sync_tolerance_ms * 1e6),
+            wait_ns=round(self.sync_wait_ms * 1e6),
+            stale_ns=round(self.sync_stale_ms * 1e6),
+            clock_ns=round(self.sync_clock_ms * 1e6),
+            absent_ns=round(self.sync_absent_ms * 1e6),
+            max_pending=self.sync_max_pending,
+            max_bytes=self.sync_max_bytes,
+        )

@@ -29,6 +29,22 @@ class Drop(StrEnum):
     """A stream message was replaced by a newer one before its reader took it."""
     NOT_FINITE = "not_finite"
     """A box held a number that is not finite."""
+    SUPERSEDED = "superseded"
+    """A frame set of a camera stream was replaced by a newer one of its site before there was room to run it."""
+    UNDECODABLE = "undecodable"
+    """No frame of a camera stream's frame set could be decoded."""
+    FRAME_REFUSED = "frame_refused"
+    """A camera stream's message was no frame of a camera of the site."""
+    FRAME_DUPLICATE = "frame_duplicate"
+    """A frame of this camera and capture time came before."""
+    FRAME_LATE = "frame_late"
+    """A frame's set had gone out, and no later set could use it as a stale one."""
+    FRAME_CLOCK = "frame_clock"
+    """The clock of a frame's camera disagrees with those of the site's other cameras."""
+    FRAME_BACKLOG = "frame_backlog"
+    """More frames of one camera, or more bytes of one site, were waiting for their set than may."""
+    FRAME_LEFT = "frame_camera_left"
+    """A frame's camera or site went before its set did."""
 
 
 class Telemetry:
@@ -55,6 +71,15 @@ class Telemetry:
         )
         self._queued = Gauge("quadlift_queued_frame_sets", "Frame sets that wait for a worker.", registry=self.registry)
         self._readers = Gauge("quadlift_stream_readers", "Stream subscribers, by site.", ["site"], registry=self.registry)
+        self._ingests = Gauge(
+            "quadlift_ingest_connections", "Camera stream connections, by site.", ["site"], registry=self.registry
+        )
+        self._skews = Histogram(
+            "quadlift_skew_seconds",
+            "How far a camera's frame lies from its set's capture time.",
+            buckets=_SECONDS,
+            registry=self.registry,
+        )
         self._ready = Gauge("quadlift_ready", "1 when the service answers frame sets.", registry=self.registry)
         for reason in Drop:
             # A counter that is there from the start can be alerted on.
@@ -94,13 +119,21 @@ class Telemetry:
         """Note how many subscribers a site's stream has."""
         self._readers.labels(site).set(count)
 
+    def ingests(self, site: str, count: int) -> None:
+        """Note how many connections feed a site."""
+        self._ingests.labels(site).set(count)
+
+    def skew(self, milliseconds: float) -> None:
+        """Note how far a frame lies from its set's capture time."""
+        self._skews.observe(abs(milliseconds) / 1e3)
+
     def ready(self, is_ready: bool) -> None:
         """Note whether the service is ready."""
         self._ready.set(int(is_ready))
 
     def forget_site(self, site: str) -> None:
         """Drop a site's series, so that sites which come and go do not grow the page for ever."""
-        for metric in (self._sets, self._boxes, self._readers):
+        for metric in (self._sets, self._boxes, self._readers, self._ingests):
             if (site,) in {tuple(s.labels.values()) for family in metric.collect() for s in family.samples}:
                 metric.remove(site)
 

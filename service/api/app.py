@@ -9,8 +9,10 @@ from contextlib import asynccontextmanager
 from fastapi import FastAPI
 
 from service import __version__
-from service.api import detect, health, sites, stream, viewer
+from service.api import detect, health, ingest, sites, stream, viewer
+from service.api.auth import Access, load_tokens
 from service.api.errors import install_error_handlers
+from service.api.feeds import Feed, Feeds
 from service.api.guard import Guard
 from service.api.live import LiveSites, TrackerFactory, default_tracker
 from service.api.recent import RecentFrames
@@ -27,7 +29,9 @@ PipelineFactory = Callable[[Settings], FrameSetRunner]
 _DESCRIPTION = """Oriented 3D boxes of vehicles from a few static, calibrated cameras.
 
 `WS /stream/{site}` sends the message of `POST /detect` for every frame set of a site, as JSON text or, with
-`?format=msgpack`, as MessagePack; while anybody listens, boxes carry `track_id` and `velocity`. Errors of all addresses
+`?format=msgpack`, as MessagePack; while anybody listens, boxes carry `track_id` and `velocity`. `WS /ingest/{site}` takes the
+cameras' frames one by one and groups them by capture time: binary messages of 4 bytes header length (big-endian), the
+header `{"camera", "captured_at", "sequence"}` as JSON, and the JPEG; it answers with errors only. Errors of all addresses
 have one form: `{"error": {"code", "message", "field", "remedy"}}`."""
 
 
@@ -36,9 +40,10 @@ def create_app(
 ) -> FastAPI:
     """Build the app. Its lifespan loads the sites and the pack, then warms up while ``/health/live`` answers already.
 
-    The factories are seams for tests and for pipelines that are loaded before.
+    The factories are seams for tests and for pipelines that are loaded before. Raises InputError for unusable tokens.
     """
     telemetry = Telemetry()
+    tokens = load_tokens(settings)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -54,19 +59,34 @@ def create_app(
         live = LiveSites(
             telemetry, tracker_factory or default_tracker, reset_s=settings.tracker_reset_s, max_readers=settings.max_readers
         )
-        service = Service(settings, telemetry, store, scheduler, live, RecentFrames(settings.viewer_max_bytes))
+
+        def make_feed(site_id: str) -> Feed:
+            return Feed(
+                lambda: store.get(site_id),
+                lambda: live.site(site_id).next_sequence(),
+                lambda frame_set: detect.answer(service, frame_set),
+                telemetry,
+                settings.sync,
+                settings.workers + 1,
+            )
+
+        feeds = Feeds(make_feed, telemetry, max_connections=settings.ingest_max_connections)
+        service = Service(settings, telemetry, store, scheduler, live, feeds, RecentFrames(settings.viewer_max_bytes))
         app.state.service = service
         warming = asyncio.create_task(service.warm_up(runner))
         try:
             yield
         finally:
+            await feeds.stop()
             await asyncio.to_thread(service.stop)
             await warming
 
     app = FastAPI(title="Quadlift", version=__version__, description=_DESCRIPTION, lifespan=lifespan, redoc_url=None)
+    app.add_middleware(Access, tokens=tokens, allowed_origins=settings.allowed_origins)
+    # The one added last is the outermost: refusals are counted too.
     app.add_middleware(Guard, telemetry=telemetry)
     install_error_handlers(app)
-    for room in (detect, sites, stream, health):
+    for room in (detect, sites, stream, ingest, health):
         app.include_router(room.router)
     if settings.viewer:
         app.include_router(viewer.router)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +11,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import Request
 
-from service.errors import InputError, TooLargeError
+from service.errors import InputError, SlowSenderError, TooLargeError
 
 _FORM_REMEDY = "Send multipart/form-data with one file part a camera, for example: curl -F north=@north.jpg."
 
@@ -25,16 +26,28 @@ class Part:
     data: bytes
 
 
-async def read_body(request: Request, max_bytes: int) -> bytes:
-    """The request's body. Raises TooLargeError as soon as it is, or announces to be, longer than ``max_bytes``."""
+async def read_body(request: Request, max_bytes: int, limit_s: float) -> bytes:
+    """The request's body.
+
+    Raises TooLargeError as soon as it is, or announces to be, longer than ``max_bytes``; SlowSenderError when it has not come
+    after ``limit_s`` seconds.
+    """
     announced = request.headers.get("content-length", "")
     if announced.isdecimal() and int(announced) > max_bytes:
         raise _too_long(f"{announced} bytes announced", max_bytes)
     body = bytearray()
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > max_bytes:
-            raise _too_long("more bytes", max_bytes)
+    try:
+        async with asyncio.timeout(limit_s):
+            async for chunk in request.stream():
+                body += chunk
+                if len(body) > max_bytes:
+                    raise _too_long("more bytes", max_bytes)
+    except TimeoutError:
+        raise SlowSenderError(
+            f"{len(body)} bytes came within {limit_s:g} s, and not the end.",
+            field="body",
+            remedy="Send faster, compress the frames more, or raise QUADLIFT_BODY_RECEIVE_S.",
+        ) from None
     return bytes(body)
 
 

@@ -42,7 +42,7 @@ _REQUEST_BODY: dict[str, Any] = {
 @router.post(
     "/detect",
     openapi_extra=_REQUEST_BODY,
-    responses={200: {"model": Detections}, **{code: {"model": ErrorMessage} for code in (404, 413, 422, 503)}},
+    responses={200: {"model": Detections}, **{code: {"model": ErrorMessage} for code in (404, 408, 413, 422, 503)}},
 )
 async def detect(
     request: Request,
@@ -58,7 +58,7 @@ async def detect(
     arrived_at_ns = time.time_ns()
     known_site = service.store.get(site)
     service.require_ready()
-    body = await read_body(request, service.settings.max_body_bytes)
+    body = await read_body(request, service.settings.max_body_bytes, service.settings.body_receive_s)
     frames, captured_at_ns = await asyncio.to_thread(
         frames_from_form, body, request.headers.get("content-type"), known_site, service.settings.frame_limits, arrived_at_ns
     )
@@ -78,6 +78,9 @@ async def answer(service: Service, frame_set: FrameSet, *, per_camera: bool = Fa
         compose = partial(detections_message, frame_set, result, tracked, track_ms)
         message, encoded = await asyncio.to_thread(_compose, compose, "msgpack" in live.formats())
         statuses = [camera.status for camera in message.cameras.values()]
+        for camera in message.cameras.values():
+            if camera.skew_ms is not None:
+                service.telemetry.skew(camera.skew_ms)
         service.telemetry.frame_set(frame_set.site.id, statuses, len(message.boxes), message.timing_ms.model_dump())
         if service.settings.viewer:
             service.recent.add(frame_set)

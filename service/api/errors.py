@@ -11,7 +11,7 @@ from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
-from service.errors import InputError, OverloadError, QuadliftError
+from service.errors import InputError, OverloadError, QuadliftError, UnauthorizedError
 from service.schemas import ErrorDetail, ErrorMessage
 
 INTERNAL = QuadliftError("something went wrong inside the service.", remedy="The service's log says what.")
@@ -26,10 +26,17 @@ _REMEDIES = {
 
 def error_response(error: QuadliftError) -> Response:
     """The answer for an error of the service's own tree."""
-    headers = {"Retry-After": str(error.retry_after_s)} if isinstance(error, OverloadError) else {}
-    return _response(
-        error.status, ErrorDetail(code=error.code, message=error.message, field=error.field, remedy=error.remedy), headers
-    )
+    headers = {}
+    if isinstance(error, OverloadError):
+        headers["Retry-After"] = str(error.retry_after_s)
+    if isinstance(error, UnauthorizedError):
+        headers["WWW-Authenticate"] = "Bearer"
+    return _response(error.status, _detail(error), headers)
+
+
+def error_text(error: QuadliftError) -> str:
+    """The same for a WebSocket: the error's JSON."""
+    return _body(_detail(error)).decode()
 
 
 def install_error_handlers(app: FastAPI) -> None:
@@ -73,5 +80,12 @@ def _http(request: Request, error: Exception) -> Response:
 
 
 def _response(status: int, detail: ErrorDetail, headers: Mapping[str, str]) -> Response:
-    body = orjson.dumps(ErrorMessage(error=detail).model_dump())
-    return Response(body, status, headers, "application/json")
+    return Response(_body(detail), status, headers, "application/json")
+
+
+def _detail(error: QuadliftError) -> ErrorDetail:
+    return ErrorDetail(code=error.code, message=error.message, field=error.field, remedy=error.remedy)
+
+
+def _body(detail: ErrorDetail) -> bytes:
+    return orjson.dumps(ErrorMessage(error=detail).model_dump())

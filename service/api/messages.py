@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import msgpack
 import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from service.frames import FrameSet
+from service.frames import EncodedFrame, FrameSet
 from service.geometry.boxes import STATE_DIM, Boxes
 from service.schemas import Box, CameraStatus, Detections, Timing, rfc3339_from_ns
 
@@ -120,24 +120,36 @@ def _boxes(
 
 def _camera_statuses(frame_set: FrameSet, result: SetResult) -> dict[str, CameraStatus]:
     frames = {frame.camera_id: frame for frame in frame_set.frames}
-    statuses = {}
-    for camera in frame_set.site.cameras:
-        frame = frames.get(camera.id)
-        if frame is None:
-            statuses[camera.id] = CameraStatus(status="missing")
-            continue
-        time_ns = frame_set.captured_at_ns if frame.captured_at_ns is None else frame.captured_at_ns
-        captured_at, skew_ms = rfc3339_from_ns(time_ns), (time_ns - frame_set.captured_at_ns) / 1e6
-        failure = result.failed.get(camera.id)
-        if failure is None:
-            statuses[camera.id] = CameraStatus(
-                status="ok", captured_at=captured_at, skew_ms=skew_ms, detections=result.detections.get(camera.id, 0)
-            )
-        else:
-            statuses[camera.id] = CameraStatus(
-                status="bad", captured_at=captured_at, skew_ms=skew_ms, detections=0, message=failure.message
-            )
-    return statuses
+    return {
+        camera.id: _refused_status(frame_set, camera.id)
+        if camera.id not in frames
+        else _frame_status(frame_set, frames[camera.id], result)
+        for camera in frame_set.site.cameras
+    }
+
+
+def _refused_status(frame_set: FrameSet, camera_id: str) -> CameraStatus:
+    refused = frame_set.refused.get(camera_id)
+    if refused is None:
+        return CameraStatus(status="missing")
+    captured_at, skew_ms = _times(frame_set, refused.captured_at_ns)
+    return CameraStatus(status="bad", captured_at=captured_at, skew_ms=skew_ms, detections=0, message=refused.reason)
+
+
+def _frame_status(frame_set: FrameSet, frame: EncodedFrame, result: SetResult) -> CameraStatus:
+    captured_at, skew_ms = _times(frame_set, frame.captured_at_ns)
+    failure = result.failed.get(frame.camera_id)
+    if failure is not None:
+        return CameraStatus(status="bad", captured_at=captured_at, skew_ms=skew_ms, detections=0, message=failure.message)
+    status: Literal["ok", "stale"] = "stale" if frame.camera_id in frame_set.stale else "ok"
+    detections = result.detections.get(frame.camera_id, 0)
+    return CameraStatus(status=status, captured_at=captured_at, skew_ms=skew_ms, detections=detections)
+
+
+def _times(frame_set: FrameSet, time_ns: int | None) -> tuple[str, float]:
+    """A frame's capture time as RFC 3339, and its skew in ms; a frame without one has its set's."""
+    known_ns = frame_set.captured_at_ns if time_ns is None else time_ns
+    return rfc3339_from_ns(known_ns), (known_ns - frame_set.captured_at_ns) / 1e6
 
 
 def _finite_rows(boxes: Boxes) -> NDArray[np.bool_]:

@@ -17,7 +17,7 @@ from service.geometry.camera import Camera
 from service.schemas import ErrorMessage
 from service.site import CameraModel, Site, SiteModel, parse_site, site_document
 
-router = APIRouter(prefix="/sites", tags=["sites"], responses={code: {"model": ErrorMessage} for code in (404, 413, 422)})
+router = APIRouter(prefix="/sites", tags=["sites"], responses={code: {"model": ErrorMessage} for code in (404, 408, 413, 422)})
 
 
 def _json(content: Any, status: int = 200) -> Response:
@@ -43,7 +43,7 @@ async def get_site(site: str, service: ServiceDep) -> Response:
 @router.put("/{site}", openapi_extra=_body_of(SiteModel), responses={200: {"model": SiteModel}, 201: {"model": SiteModel}})
 async def put_site(site: str, request: Request, service: ServiceDep) -> Response:
     """Add a site (201) or replace it (200); answers with the site as kept. The stream, if it runs, goes on."""
-    body = await read_body(request, service.settings.max_body_bytes)
+    body = await read_body(request, service.settings.max_body_bytes, service.settings.body_receive_s)
     new = await asyncio.to_thread(_parse_site, body, site)
     created = await asyncio.to_thread(service.store.put, new)
     return _json(site_document(new), 201 if created else 200)
@@ -53,6 +53,7 @@ async def put_site(site: str, request: Request, service: ServiceDep) -> Response
 async def delete_site(site: str, service: ServiceDep) -> Response:
     """Drop a site and end its streams."""
     await asyncio.to_thread(service.store.delete, site)
+    service.feeds.forget_site(site)
     service.live.forget_site(site)
     service.recent.forget_site(site)
     service.telemetry.forget_site(site)
@@ -73,7 +74,7 @@ async def get_camera(site: str, camera: str, service: ServiceDep) -> Response:
 async def put_camera(site: str, camera: str, request: Request, service: ServiceDep) -> Response:
     """Let a camera join a site (201), or replace its calibration (200), while the site runs."""
     service.store.get(site)
-    body = await read_body(request, service.settings.max_body_bytes)
+    body = await read_body(request, service.settings.max_body_bytes, service.settings.body_receive_s)
     new = await asyncio.to_thread(_parse_camera, body, camera)
     created = await asyncio.to_thread(service.store.put_camera, site, new)
     return _json(_camera_document(new), 201 if created else 200)

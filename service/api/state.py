@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from fastapi import Depends
 from starlette.requests import HTTPConnection
 
+from service.api.feeds import Feeds
 from service.api.live import LiveSites
 from service.api.recent import RecentFrames
 from service.errors import OverloadError
@@ -37,6 +38,7 @@ class Service:
     store: SitesStore
     scheduler: Scheduler
     live: LiveSites
+    feeds: Feeds
     recent: RecentFrames
     phase: Phase = field(default="starting", init=False)
 

@@ -92,7 +92,7 @@ function describe({ status, detections, skew_ms: skew, message }) {
 // ---- messages ----
 
 async function fetchPicture(message, camera) {
-  if (message.cameras[camera.id]?.status !== "ok") return null;
+  if (!["ok", "stale"].includes(message.cameras[camera.id]?.status)) return null;
   const path = `sites/${encodeURIComponent(message.site)}/frames/${encodeURIComponent(camera.id)}?sequence=${message.sequence}`;
   const response = await fetch(path, { cache: "no-store" });
   if (response.status === 404) return undefined; // Already replaced by newer frames.

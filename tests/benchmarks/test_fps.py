@@ -36,7 +36,7 @@ def run(*arguments: str) -> tuple[int, dict[str, object]]:
     return result.exit_code, json.loads(result.stdout)
 
 
-@pytest.mark.parametrize("via", ["inproc", "http"])
+@pytest.mark.parametrize("via", ["inproc", "http", "ws"])
 def test_the_figures_of_the_contract(via: str) -> None:
     code, figures = run("--seconds", "1", "--via", via, "--target", "0.1")
     assert code == 0
@@ -65,4 +65,4 @@ def test_every_set_of_a_closed_loop_is_answered() -> None:
 
 
 def test_via_names_its_ways() -> None:
-    assert [way.value for way in Via] == ["inproc", "http"]
+    assert [way.value for way in Via] == ["inproc", "http", "ws"]

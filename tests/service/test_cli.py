@@ -150,3 +150,16 @@ def test_schemas_import_nothing_heavy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("given", [{"QUADLIFT_TLS_CERT": "cert.pem"}, {"QUADLIFT_TLS_KEY": "key.pem"}])
+def test_half_of_tls_ends_in_one_line(given: dict[str, str], site_file: Path) -> None:
+    result = runner.invoke(app, ["serve", "--site", str(site_file)], env=given)
+    assert result.exit_code == 1
+    assert "tls_" in result.output
+
+
+def test_unusable_tokens_end_in_one_line(site_file: Path) -> None:
+    result = runner.invoke(app, ["serve", "--site", str(site_file)], env={"QUADLIFT_TOKENS": "read short"})
+    assert result.exit_code == 1
+    assert "QUADLIFT_TOKENS, line 1" in result.output

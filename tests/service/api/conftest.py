@@ -124,7 +124,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
 class ServiceClient(httpx.Client):
     """A client of a service that really listens, in a thread of the test's process."""
 
-    def __init__(self, app: FastAPI) -> None:
+    def __init__(self, app: FastAPI, headers: dict[str, str] | None = None) -> None:
         self.app = app
         config = uvicorn.Config(app, port=0, log_config=None, timeout_graceful_shutdown=2)
         self._server = uvicorn.Server(config)
@@ -132,7 +132,7 @@ class ServiceClient(httpx.Client):
         self._thread.start()
         wait_until(lambda: self._server.started or not self._thread.is_alive())
         self.address = f"127.0.0.1:{self._server.servers[0].sockets[0].getsockname()[1]}"
-        super().__init__(base_url=f"http://{self.address}", timeout=20)
+        super().__init__(base_url=f"http://{self.address}", timeout=20, headers=headers)
 
     def stream(self, path: str = "/stream/demo") -> ClientConnection:  # type: ignore[override]
         """Subscribe to a stream."""
@@ -150,8 +150,8 @@ def start(pipeline: FakePipeline) -> Iterator[Callable[..., ServiceClient]]:
     """Start a service with settings; by default it has the site ``demo`` with cameras ``north`` and ``east``, and is ready."""
     clients: list[ServiceClient] = []
 
-    def build(ready: bool = True, **options: Any) -> ServiceClient:
-        client = ServiceClient(create_app(Settings(workers=2, **options), lambda _: pipeline))
+    def build(ready: bool = True, headers: dict[str, str] | None = None, **options: Any) -> ServiceClient:
+        client = ServiceClient(create_app(Settings(workers=2, **options), lambda _: pipeline), headers)
         clients.append(client)
         assert client.put("/sites/demo", json=site_body()).status_code == 201
         if ready:

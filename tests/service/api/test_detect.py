@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import socket
 import struct
 import threading
 from collections.abc import Callable, Iterator
@@ -231,3 +232,12 @@ def test_not_ready_is_503(start: Callable[..., httpx.Client], pipeline: Any, too
     response = tools.detect(client)
     tools.error(response, 503)
     assert response.headers["retry-after"]
+
+
+def test_a_body_that_does_not_come_is_answered_in_time(start: Callable[..., Any]) -> None:
+    host, port = start(body_receive_s=0.2).address.split(":")
+    with socket.create_connection((host, int(port)), timeout=5) as raw:
+        raw.sendall(b"POST /detect?site=demo HTTP/1.1\r\nHost: x\r\nContent-Length: 5000\r\n\r\nslow")
+        answer = raw.recv(4096)
+    assert answer.startswith(b"HTTP/1.1 408 ")
+    assert b"too_slow" in answer
