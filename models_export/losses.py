@@ -56,6 +56,17 @@ def multibin_loss(
     return {"total": total, "size": size, "bins": bins, "angle": angle.mean()}
 
 
+def likelihood_loss(error: Tensor, log_sigma: Tensor, beta: float = 0.5) -> Tensor:
+    """Gaussian negative log-likelihood (N, ...) of errors whose standard deviation is predicted, in nats, without its constant.
+
+    Each term is weighted by sigma^(2 beta), held constant: beta 0 is the plain likelihood, under which a network gives up on
+    what it finds hard; beta 1 trains the error like squares (Seitzer et al., On the Pitfalls of Heteroscedastic Uncertainty
+    Estimation). For any beta the best sigma is the error's root mean square.
+    """
+    weight = torch.exp(2 * beta * log_sigma).detach()
+    return weight * (0.5 * (error * torch.exp(-log_sigma)) ** 2 + log_sigma)
+
+
 def align(values: Tensor, mask: Tensor) -> Tensor:
     """Values (B, H, W) less their median, over their mean absolute deviation, per image over valid pixels only.
 

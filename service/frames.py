@@ -162,6 +162,16 @@ def decode(data: bytes, camera: Camera, max_width: int) -> UInt8Image:
     return np.ascontiguousarray(image)
 
 
+def reduced(image: UInt8Image, max_width: int) -> UInt8Image:
+    """An image (H, W, 3) at most ``max_width`` px wide, by a whole factor; the same one where it is narrow enough."""
+    height, width = image.shape[:2]
+    factor = -(-width // max_width)
+    if factor == 1:
+        return image
+    size = (round(width / factor), round(height / factor))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
 def _scaled_size(width: int, height: int, max_width: int) -> tuple[int, int]:
     if width <= max_width:
         return width, height

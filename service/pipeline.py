@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import cv2
@@ -14,15 +15,16 @@ from numpy.typing import NDArray
 
 from service.depth_scale import DepthReadings, DepthScales, read_boxes
 from service.errors import FrameError
-from service.frames import FrameSet, decode
+from service.frames import FrameSet, decode, reduced
 from service.fusion import CameraParts, FusedBoxes, FusionSettings, fuse
 from service.geometry.boxes import Boxes, clip_extents, cut_edges
 from service.geometry.camera import Camera, UInt8Image, yaw_from_alpha
+from service.geometry.transforms import Array
 from service.lifting import LiftSettings, Measurements, lift
 from service.nets.canvas import canvas_size
 from service.nets.depth import DepthNet
 from service.nets.detector import Detections, Detector, edge_sigma
-from service.nets.multibin import Multibin, MultibinEstimates, crop_vehicles
+from service.nets.multibin import Crops, Multibin, MultibinEstimates, cut_crops
 from service.nets.pack import Pack
 from service.paper_fusion import PaperFusionSettings, fuse_paper
 from service.site import Site
@@ -95,24 +97,23 @@ class Pipeline:
         images = [np.full((height, width, 3), 114, np.uint8)] * 4
         self.detector.detect(images)
         self.depth.infer(images)
-        self.multibin.estimate(
-            crop_vehicles(images[0], [[0.0, 0.0, 20.0, 20.0]], self.multibin.spec.crop_px), np.zeros(1, np.int64)
-        )
+        self.multibin.estimate(cut_crops(images[0], [[0.0, 0.0, 20.0, 20.0]], self.multibin.spec.crop_px), np.zeros(1, np.int64))
 
     def run(self, frame_set: FrameSet) -> SetResult:
         """All steps for one set. Raises the first FrameError when not one frame can be decoded."""
         timing: dict[str, float] = {}
         started = time.perf_counter()
         with _timed(timing, "decode"):
-            cameras, images, failed = self._decode(frame_set)
+            views, failed = self._decode(frame_set)
+        cameras, images = [view.camera for view in views], [view.small for view in views]
         with _timed(timing, "detect"):
             found = self.detector.detect(images, score_threshold=self.settings.score_threshold, nms_iou=self.settings.nms_iou)
         with _timed(timing, "orient"):
-            estimates = self._orient(images, found)
+            estimates = self._orient(views, found)
         with _timed(timing, "depth"):
-            readings = self._read_depth(frame_set, cameras, images, found)
+            readings = self._read_depth(frame_set, views, found)
         with _timed(timing, "lift"):
-            measurements = self._measurements(cameras, found, estimates, readings)
+            measurements = self._measurements(views, found, estimates, readings)
             lifted = self._lift(cameras, frame_set.site, measurements)
         with _timed(timing, "fuse"):
             fused = self._fuse(lifted, measurements.camera_index, cameras)
@@ -150,66 +151,113 @@ class Pipeline:
         sigma = np.sqrt(boxes.covariance[:, 0, 0] + boxes.covariance[:, 1, 1])
         return confident & (sigma <= self.settings.max_position_sigma_m)
 
-    def _decode(self, frame_set: FrameSet) -> tuple[list[Camera], list[UInt8Image], dict[str, FrameError]]:
-        """Images, and the cameras at the images' sizes."""
-        cameras, images, failed = [], [], {}
+    def _decode(self, frame_set: FrameSet) -> tuple[list[_View], dict[str, FrameError]]:
+        views, failed = [], {}
+        small_width = self.detector.spec.max_width
+        width = max(self.multibin.spec.max_width or 0, small_width)
         for frame in frame_set.frames:
             camera = frame_set.site.camera(frame.camera_id)
             try:
-                image = decode(frame.data, camera, self.detector.spec.max_width)
+                image = decode(frame.data, camera, width)
             except FrameError as error:
                 failed[camera.id] = error
                 continue
-            images.append(image)
-            cameras.append(camera.scaled(image.shape[1], image.shape[0]))
-        if failed and not images:
+            views.append(_View(camera, image, reduced(image, small_width)))
+        if failed and not views:
             raise next(iter(failed.values()))
-        return cameras, images, failed
+        return views, failed
 
-    def _orient(self, images: list[UInt8Image], found: list[Detections]) -> MultibinEstimates:
+    def _orient(self, views: list[_View], found: list[Detections]) -> MultibinEstimates:
         size = self.multibin.spec.crop_px
-        crops = [crop_vehicles(image, detections.xyxy_px, size) for image, detections in zip(images, found, strict=True)]
-        return self.multibin.estimate(np.concatenate(crops), np.concatenate([detections.cls for detections in found]))
+        crops = [
+            cut_crops(view.image, detections.scaled(view.scale).xyxy_px, size)
+            for view, detections in zip(views, found, strict=True)
+        ]
+        return self.multibin.estimate(Crops.concatenate(crops), np.concatenate([detections.cls for detections in found]))
 
-    def _read_depth(
-        self, frame_set: FrameSet, cameras: list[Camera], images: list[UInt8Image], found: list[Detections]
-    ) -> DepthReadings:
+    def _read_depth(self, frame_set: FrameSet, views: list[_View], found: list[Detections]) -> DepthReadings:
         parts = []
-        for camera, inverse, detections in zip(cameras, self.depth.infer(images), found, strict=True):
-            scale = self._scales.update(frame_set.site.camera(camera.id), camera, frame_set.site.ground, inverse)
+        maps = self.depth.infer([view.small for view in views])
+        for view, inverse, detections in zip(views, maps, found, strict=True):
+            scale = self._scales.update(view.own, view.small_camera, frame_set.site.ground, inverse)
             parts.append(read_boxes(inverse, scale, detections.xyxy_px, self.depth.reading))
         return DepthReadings(np.concatenate([p.depth_m for p in parts]), np.concatenate([p.sigma_m for p in parts]))
 
     def _measurements(
-        self, cameras: list[Camera], found: list[Detections], estimates: MultibinEstimates, readings: DepthReadings
+        self, views: list[_View], found: list[Detections], estimates: MultibinEstimates, readings: DepthReadings
     ) -> Measurements:
-        index = np.repeat(np.arange(len(cameras)), [len(detections) for detections in found])
-        xyxy = np.concatenate([clip_extents(camera, d.xyxy_px) for camera, d in zip(cameras, found, strict=True)])
-        centers = (xyxy[:, :2] + xyxy[:, 2:]) / 2
-        yaw, is_cut = np.zeros(len(index)), np.zeros(len(index), dtype=bool)
+        index = np.repeat(np.arange(len(views)), [len(detections) for detections in found])
+        large = [detections.scaled(view.scale) for view, detections in zip(views, found, strict=True)]
+        seen = np.concatenate([clip_extents(view.camera, d.xyxy_px) for view, d in zip(views, large, strict=True)])
+        cut = np.concatenate([cut_edges(view.camera, seen[index == row]) for row, view in enumerate(views)])
+        score = np.concatenate([d.score for d in found])
+        edges = self._edges(views, index, seen, cut, estimates, score)
         # A quantised network can give a heading vector of length zero, whose angle is not a number.
         headed = np.isfinite(estimates.alpha)
-        alpha = np.where(headed, estimates.alpha, 0.0)
-        for row, camera in enumerate(cameras):
+        alpha, yaw = np.where(headed, estimates.alpha, 0.0), np.zeros(len(index))
+        centers = (seen[:, :2] + seen[:, 2:]) / 2
+        for row, view in enumerate(views):
             own = index == row
-            yaw[own] = yaw_from_alpha(camera, alpha[own], centers[own])
-            is_cut[own] = cut_edges(camera, xyxy[own]).any(1)
-        spec = self.multibin.spec
-        score = np.concatenate([d.score for d in found])
+            yaw[own] = yaw_from_alpha(view.camera, alpha[own], centers[own])
+        sigma_yaw, sigma_dims = self.multibin.spec.sigmas(estimates, score, cut.any(1))
         return Measurements(
             camera_index=index,
-            xyxy_px=xyxy,
-            sigma_px=edge_sigma(self.detector.spec, xyxy, score, is_cut),
+            xyxy_px=edges[0],
+            sigma_px=edges[1],
             dims_lwh=estimates.dims_lwh,
-            sigma_dims=np.stack([model.sigma(score, is_cut) for model in spec.sigma_dims_lwh], 1),
+            sigma_dims=sigma_dims,
             yaw=yaw,
-            sigma_yaw=np.where(headed, spec.sigma_alpha_rad.sigma(score, is_cut), _UNKNOWN_YAW_SIGMA),
+            sigma_yaw=np.where(headed, sigma_yaw, _UNKNOWN_YAW_SIGMA),
             flip_log_odds=np.where(headed, estimates.flip_log_odds, 0.0),
             score=score,
             cls=np.concatenate([d.cls for d in found]),
             depth_m=readings.depth_m,
             sigma_depth_m=readings.sigma_m,
         )
+
+    def _edges(
+        self,
+        views: list[_View],
+        index: NDArray[np.int64],
+        seen: Array,
+        cut: NDArray[np.bool_],
+        estimates: MultibinEstimates,
+        score: Array,
+    ) -> tuple[Array, Array]:
+        """Edges (N, 4) and their sigmas (N, 4), px: the head's own where it reads any, else the detector's ``seen``.
+
+        An edge that the image border cuts stays at the border, whatever the head makes of it.
+        """
+        if estimates.xyxy_px is None or estimates.sigma is None:
+            scale = np.array([view.scale for view in views]).reshape(-1, 2)[index]
+            small = (seen + 0.5) / np.tile(scale, 2) - 0.5
+            return seen, edge_sigma(self.detector.spec, small, score, cut.any(1)) * np.tile(scale, 2)
+        return np.where(cut, seen, estimates.xyxy_px), estimates.sigma[:, 4:]
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """One camera's decoded frame: as the crops are cut from it, and as the detector and the depth net see it."""
+
+    own: Camera
+    """The site's camera, at the size of its frames."""
+    image: UInt8Image
+    small: UInt8Image
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The camera at the size of ``image``."""
+        return self.own.scaled(self.image.shape[1], self.image.shape[0])
+
+    @cached_property
+    def small_camera(self) -> Camera:
+        """The camera at the size of ``small``."""
+        return self.own.scaled(self.small.shape[1], self.small.shape[0])
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        """Pixels of ``image`` a pixel of ``small``, across and down."""
+        return self.image.shape[1] / self.small.shape[1], self.image.shape[0] / self.small.shape[0]
 
 
 def _timed_parts(parts: CameraParts, frame_set: FrameSet, cameras: list[Camera]) -> CameraParts:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from models_export.data.dataset import Scene, list_scenes, open_scene
+from models_export.data.dataset import Scene, SceneTruth, list_scenes, open_scene
 from service.errors import InputError
 from service.frames import decode
 from service.geometry.boxes import clip_extents, project_extents
@@ -91,30 +91,53 @@ def load_samples(scenes: Iterable[Path], classes: tuple[str, ...], max_width: in
 def _load_sample(
     scene: Scene, step: int, camera_index: int, camera: Camera, classes: tuple[str, ...], max_width: int, depth_stride: int
 ) -> Sample:
-    truth = scene.truth(step)
     image = decode(scene.frame_bytes(camera.id, step), camera, max_width)
     scaled = camera.scaled(image.shape[1], image.shape[0])
-    extents, in_front = project_extents(scaled, truth.center, truth.dims_lwh, truth.yaw)
-    kinds = np.array([name.lower() for name in truth.classes])
-    seen = in_front & (truth.visible[:, camera_index] > 0) & (np.isin(kinds, classes) | np.isin(kinds, VEHICLES))
-    xyxy = clip_extents(scaled, extents[seen])
-    visible, truncated = truth.visible[seen, camera_index], truth.truncated[seen, camera_index]
-    sides = xyxy[:, 2:] - xyxy[:, :2]
-    known = np.isin(kinds[seen], classes)
-    ignore = ~known | (visible < MIN_VISIBLE) | (sides.min(1, initial=np.inf) < MIN_SIDE_PX) | (truncated > MAX_TRUNCATED)
+    labels = label_vehicles(scene.truth(step), camera_index, scaled, classes)
     return Sample(
         canvas=to_canvas(image),
         image_size=(image.shape[1], image.shape[0]),
         camera=scaled,
+        ground=scene.site.ground,
+        inverse_depth=_inverse_depth(scene.depth(camera.id, step), to_canvas(image).shape[:2], image.shape[:2], depth_stride),
+        **vars(labels),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """The vehicles that one camera shows; fields as in :class:`Sample`."""
+
+    xyxy_px: Array
+    ignore: NDArray[np.bool_]
+    cls: NDArray[np.int64]
+    dims_lwh: Array
+    alpha: Array
+    visible: Array
+    truncated: Array
+
+
+def label_vehicles(
+    truth: SceneTruth, camera_index: int, camera: Camera, classes: tuple[str, ...], min_side_px: float = MIN_SIDE_PX
+) -> Labels:
+    """What is asked of a detector in one image: ``camera`` at the image's size, column ``camera_index`` of the truth."""
+    extents, in_front = project_extents(camera, truth.center, truth.dims_lwh, truth.yaw)
+    # Kinds are finer than KITTI's classes, which call a bus a truck.
+    kinds = np.array([name.lower() for name in truth.kinds or truth.classes])
+    seen = in_front & (truth.visible[:, camera_index] > 0) & (np.isin(kinds, classes) | np.isin(kinds, VEHICLES))
+    xyxy = clip_extents(camera, extents[seen])
+    visible, truncated = truth.visible[seen, camera_index], truth.truncated[seen, camera_index]
+    sides = xyxy[:, 2:] - xyxy[:, :2]
+    known = np.isin(kinds[seen], classes)
+    ignore = ~known | (visible < MIN_VISIBLE) | (sides.min(1, initial=np.inf) < min_side_px) | (truncated > MAX_TRUNCATED)
+    return Labels(
         xyxy_px=xyxy,
         ignore=ignore,
         cls=np.array([classes.index(kind) if kind in classes else 0 for kind in kinds[seen]], dtype=np.int64),
         dims_lwh=truth.dims_lwh[seen],
-        alpha=wrap_angle(truth.yaw[seen] - ray_azimuth(scaled, (xyxy[:, :2] + xyxy[:, 2:]) / 2)),
+        alpha=wrap_angle(truth.yaw[seen] - ray_azimuth(camera, (xyxy[:, :2] + xyxy[:, 2:]) / 2)),
         visible=visible,
         truncated=truncated,
-        ground=scene.site.ground,
-        inverse_depth=_inverse_depth(scene.depth(camera.id, step), to_canvas(image).shape[:2], image.shape[:2], depth_stride),
     )
 
 

@@ -15,14 +15,14 @@ from models_export.nets.blocks import Normalise, conv
 class DepthConfig:
     """Shape of the depth net."""
 
-    stem: tuple[int, int, int, int] = (24, 48, 96, 144)
+    stem: tuple[int, int, int, int] = (16, 32, 64, 128)
     """Channels at strides 4, 8, 16, 32 of the canvas."""
-    width: int = 144
+    width: int = 128
     """Channels of a token."""
-    blocks: int = 6
+    blocks: int = 3
     heads: int = 4
-    mlp_ratio: int = 3
-    decoder: int = 48
+    mlp_ratio: int = 2
+    decoder: int = 24
     """Channels of the decoder."""
     stride: int = 8
     """Canvas pixels an output cell; fixed by the decoder's plan."""

@@ -18,7 +18,7 @@ _PRIOR_OBJECTNESS_LOGIT = -4.6
 class DetectorConfig:
     """Shape of the detector."""
 
-    classes: tuple[str, ...] = ("car",)
+    classes: tuple[str, ...] = ("car", "van", "truck", "bus")
     strides: tuple[int, int, int] = (8, 16, 32)
     anchors_px: tuple[tuple[tuple[float, float], ...], ...] = (
         ((14.0, 9.0), (22.0, 14.0), (36.0, 18.0)),
@@ -30,7 +30,7 @@ class DetectorConfig:
     """Widest image that the detector is given, px."""
     channels: tuple[int, ...] = (16, 32, 64, 128, 192)
     """Channels after the stem and after each stage (strides 2, 4, 8, 16, 32)."""
-    residuals: tuple[int, ...] = (1, 2, 2, 1)
+    residuals: tuple[int, ...] = (1, 2, 3, 2)
     """Residual blocks of the stages at strides 4, 8, 16, 32."""
 
 

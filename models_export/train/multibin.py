@@ -10,27 +10,24 @@ import torch
 from torch import Tensor, nn
 
 from models_export.data.augment import AugmentConfig, photometric
-from models_export.data.samples import Sample
-from models_export.losses import multibin_loss
-from models_export.nets.multibin import EdgeMultibin, MultibinConfig
+from models_export.data.vehicles import Vehicle
+from models_export.losses import likelihood_loss, multibin_loss
+from models_export.nets.multibin import SIGMA_UNITS, EdgeMultibin, MultibinConfig
 from models_export.train.loop import Batch
-from service.geometry.camera import ray_azimuth
-from service.geometry.transforms import Array, wrap_angle
-from service.nets.multibin import crop_vehicles
+from service.geometry.transforms import Array
 
-JITTER = 0.06
-"""Standard deviation of a box edge in training over the box's side: the detector's boxes are not exact either."""
+JITTER, MAX_JITTER = 0.06, 0.15
+"""Standard deviation and limit of a box edge in training over the box's side: the detector's boxes are not exact either."""
 
 
 class MultibinTask:
-    """The multi-bin head with the vehicles of its training samples."""
+    """The multi-bin head with its training vehicles."""
 
     name = "multibin"
 
-    def __init__(self, samples: list[Sample], config: MultibinConfig, augment: AugmentConfig | None = None) -> None:
-        self.samples = samples
-        self.vehicles = np.array([(i, j) for i, s in enumerate(samples) for j in np.nonzero(~s.ignore)[0]], dtype=np.int64)
-        self.config = replace(config, mean_dims_lwh=mean_dims(samples, len(config.classes)))
+    def __init__(self, vehicles: list[Vehicle], config: MultibinConfig, augment: AugmentConfig | None = None) -> None:
+        self.vehicles = vehicles
+        self.config = replace(config, mean_dims_lwh=mean_dims(vehicles, len(config.classes)))
         self.augment = augment or AugmentConfig()
         self.net = EdgeMultibin(self.config)
 
@@ -39,47 +36,57 @@ class MultibinTask:
         return {"net": asdict(self.config), "augment": asdict(self.augment), "vehicles": len(self.vehicles)}
 
     def batch(self, rng: np.random.Generator, size: int) -> Batch:
-        """Crops (N, S, S, 3) uint8, alpha (N,), size residuals (N, 3) metres."""
-        crops, alphas, residuals = [], [], []
+        """Crops (N, S, S, 3) uint8, alpha (N,), size residuals (N, 3) metres, edges (N, 4) in sides of the crop."""
+        crops, alphas, residuals, edges = [], [], [], []
         means = np.array(self.config.mean_dims_lwh)
-        for sample_index, row in self.vehicles[rng.integers(len(self.vehicles), size=size)]:
-            sample = self.samples[sample_index]
-            crop, alpha = _jittered(sample, row, rng, self.config.crop_px)
+        for index in rng.integers(len(self.vehicles), size=size):
+            vehicle = self.vehicles[index]
+            crop, alpha, edge = vehicle.crop(jittered(vehicle.xyxy_px, rng), self.config.crop_px)
             if rng.random() < self.augment.flip:
-                crop, alpha = crop[:, ::-1], -alpha
+                crop, alpha, edge = crop[:, ::-1], -alpha, edge[[2, 1, 0, 3]] * [-1, 1, -1, 1]
             crops.append(photometric(crop, rng, self.augment))
             alphas.append(alpha)
-            residuals.append(sample.dims_lwh[row] - means[sample.cls[row]])
-        return {
-            "crops": torch.from_numpy(np.stack(crops)),
-            "alpha": torch.tensor(np.array(alphas), dtype=torch.float32),
-            "residuals": torch.tensor(np.array(residuals), dtype=torch.float32),
-        }
+            residuals.append(vehicle.dims_lwh - means[vehicle.cls])
+            edges.append(edge)
+        arrays = {"alpha": alphas, "residuals": residuals, "edges": edges}
+        tensors = {name: torch.tensor(np.array(values), dtype=torch.float32) for name, values in arrays.items()}
+        return {"crops": torch.from_numpy(np.stack(crops)), **tensors}
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """The paper's equations 2 and 3."""
-        vectors, confidence, residual = (out.float() for out in net(batch["crops"]))
+        """The paper's equations 2 and 3, and the likelihood of angle, size and edges."""
+        vectors, confidence, residual, edges, log_sigma = (out.float() for out in net(batch["crops"]))
         centers = torch.tensor(self.config.bin_centers_rad, device=vectors.device)
-        return multibin_loss(
-            vectors, confidence, residual, batch["alpha"], batch["residuals"], centers, self.config.bin_overlap_rad
+        alpha = batch["alpha"]
+        paper = multibin_loss(
+            vectors, confidence, residual, alpha, batch["residuals"], centers, self.config.bin_overlap_rad
         )
+        errors = torch.cat([angle_error(vectors, alpha, centers)[:, None], residual - batch["residuals"], edges - batch["edges"]], 1)
+        units = torch.tensor(SIGMA_UNITS, device=errors.device)
+        terms = likelihood_loss(errors / units, log_sigma - units.log()).mean(0)
+        likelihood = {"angle_nll": terms[0], "size_nll": terms[1:4].mean(), "edge_nll": terms[4:].mean()}
+        return {**paper, **likelihood, "total": paper["total"] + torch.stack(list(likelihood.values())).sum()}
 
 
-def mean_dims(samples: list[Sample], classes: int) -> tuple[tuple[float, float, float], ...]:
+def angle_error(vectors: Tensor, alpha: Tensor, bin_centers: Tensor) -> Tensor:
+    """Angle (N,) of the bin vectors (N, B, 2) less the truth ``alpha`` (N,), in the bin nearest to the truth, in -pi..pi."""
+    delta = torch.remainder(alpha[:, None] - bin_centers + torch.pi, 2 * torch.pi) - torch.pi
+    nearest = delta.abs().argmin(1, keepdim=True)
+    delta = delta.gather(1, nearest)[:, 0]
+    cosine, sine = vectors.gather(1, nearest[..., None].expand(-1, -1, 2))[:, 0].unbind(-1)
+    return torch.atan2(sine * delta.cos() - cosine * delta.sin(), cosine * delta.cos() + sine * delta.sin())
+
+
+def mean_dims(vehicles: list[Vehicle], classes: int) -> tuple[tuple[float, float, float], ...]:
     """Mean length, width, height of each class's vehicles, metres; a class without vehicles gets the mean of all."""
-    dims = np.concatenate([s.dims_lwh[~s.ignore] for s in samples])
-    cls = np.concatenate([s.cls[~s.ignore] for s in samples])
+    dims = np.array([v.dims_lwh for v in vehicles])
+    cls = np.array([v.cls for v in vehicles])
     rows = [dims[cls == c] if np.any(cls == c) else dims for c in range(classes)]
     return tuple((float(m[0]), float(m[1]), float(m[2])) for m in (np.round(r.mean(0), 4) for r in rows))
 
 
-def _jittered(sample: Sample, row: int, rng: np.random.Generator, crop_px: int) -> tuple[np.ndarray, float]:
-    """A crop around a jittered box, and alpha about the jittered centre's ray."""
-    xyxy = sample.xyxy_px[row]
-    sides = np.tile(xyxy[2:] - xyxy[:2], 2)
-    moved: Array = xyxy + rng.normal(0.0, JITTER, 4) * np.minimum(sides, 2 * sides.min())
-    centers = np.stack([(xyxy[:2] + xyxy[2:]) / 2, (moved[:2] + moved[2:]) / 2])
-    azimuth = ray_azimuth(sample.camera, centers)
-    width, height = sample.image_size
-    crop = crop_vehicles(sample.canvas[:height, :width], moved[None], crop_px)[0]
-    return crop, float(wrap_angle(sample.alpha[row] + azimuth[0] - azimuth[1]))
+def jittered(xyxy_px: Array, rng: np.random.Generator) -> Array:
+    """A box (4,) as a detector might give it."""
+    sides = np.tile(xyxy_px[2:] - xyxy_px[:2], 2)
+    noise = np.clip(rng.normal(0.0, JITTER, 4), -MAX_JITTER, MAX_JITTER)
+    moved: Array = xyxy_px + noise * np.minimum(sides, 2 * sides.min())
+    return moved

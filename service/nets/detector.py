@@ -63,6 +63,11 @@ class Detections:
     def __len__(self) -> int:
         return len(self.score)
 
+    def scaled(self, factor: ArrayLike) -> Detections:
+        """The same in the pixels of an image ``factor`` (2,) times as wide and high (pixel centres at integers)."""
+        xyxy = (self.xyxy_px + 0.5) * np.tile(np.asarray(factor, dtype=np.float64), 2) - 0.5
+        return Detections(xyxy, self.score, self.cls)
+
 
 class Detector:
     """The detector of a pack."""

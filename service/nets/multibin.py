@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,6 +18,11 @@ from service.nets.pack import Network
 CONTEXT = 1.2
 """Side of the square crop over the longer side of the 2D box: a margin, and the box's shape kept."""
 
+UNCERTAIN = ("alpha", "length", "width", "height", "left", "top", "right", "bottom")
+"""Order of the standard deviations that a head may predict: radians, metres, and sides of the crop."""
+_EDGES = slice(4, 8)
+_MIN_WINDOW_PX = 4.0
+
 
 @dataclass(frozen=True, eq=False)
 class MultibinSpec:
@@ -28,9 +34,24 @@ class MultibinSpec:
     mean_dims_lwh: Array
     """(C, 3) mean length, width, height a class, metres: the size priors."""
     sigma_dims_lwh: tuple[ErrorModel, ...]
-    """Of length, width and height, metres."""
+    """Of length, width and height, metres; for heads that do not predict their own."""
     sigma_alpha_rad: ErrorModel
-    """Of the angle, flips aside, radians."""
+    """Of the angle, flips aside, radians; for heads that do not predict their own."""
+    max_width: int | None = None
+    """Crops are cut from images of at most this width, px; None: from those that the detector sees."""
+    sigma_scale: Array | None = None
+    """(8,) what predicted standard deviations of ``UNCERTAIN`` are multiplied by, measured on validation scenes; None: the head
+    predicts none, and no edges."""
+
+    def sigmas(self, estimates: MultibinEstimates, score: ArrayLike, is_cut: ArrayLike) -> tuple[Array, Array]:
+        """Standard deviations of alpha (N,), radians, and of length, width and height (N, 3), metres.
+
+        The head's own where it predicts any; else by the detections' scores (N,) and whether the border cuts them (N,).
+        """
+        if estimates.sigma is not None:
+            return estimates.sigma[:, 0], estimates.sigma[:, 1:4]
+        sigma_dims = np.stack([model.sigma(score, is_cut) for model in self.sigma_dims_lwh], 1)
+        return self.sigma_alpha_rad.sigma(score, is_cut), sigma_dims
 
     @staticmethod
     def from_metadata(metadata: dict[str, object]) -> MultibinSpec:
@@ -42,21 +63,55 @@ class MultibinSpec:
                 mean_dims_lwh=np.array(metadata["mean_dims_lwh"], dtype=np.float64).reshape(-1, 3),
                 sigma_dims_lwh=tuple(ErrorModel.from_metadata(row) for row in metadata["sigma_dims_lwh"]),  # type: ignore[attr-defined]
                 sigma_alpha_rad=ErrorModel.from_metadata(metadata["sigma_alpha_rad"]),
+                max_width=int(metadata["max_width"]) if "max_width" in metadata else None,  # type: ignore[call-overload]
+                sigma_scale=_sigma_scale(metadata.get("sigma_scale")),
             )
         except (KeyError, TypeError, ValueError) as error:
             raise PackError(f"metadata is incomplete: {error!r}.", field="multibin", remedy="Export the pack again.") from error
 
 
+def _sigma_scale(values: object) -> Array | None:
+    """Factors (8,) from metadata. Raises ValueError when they are not positive numbers, one for each of ``UNCERTAIN``."""
+    if values is None:
+        return None
+    scale = np.asarray(values, dtype=np.float64)
+    if scale.shape != (len(UNCERTAIN),) or not (np.isfinite(scale).all() and (scale > 0).all()):
+        raise ValueError(f"sigma_scale {values!r}: {len(UNCERTAIN)} positive numbers are expected")
+    return scale
+
+
+@dataclass(frozen=True, eq=False)
+class Crops:
+    """Vehicles cut out of images."""
+
+    pixels: NDArray[np.uint8]
+    """(N, S, S, 3) RGB."""
+    window: NDArray[np.int64]
+    """(N, 3) left, top, side of each in its image, px."""
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @staticmethod
+    def concatenate(parts: Sequence[Crops]) -> Crops:
+        """All crops of several images, in order."""
+        return Crops(np.concatenate([p.pixels for p in parts]), np.concatenate([p.window for p in parts]))
+
+
 @dataclass(frozen=True, eq=False)
 class MultibinEstimates:
-    """Angles and sizes of N vehicles."""
+    """Angles and sizes of N vehicles; of heads that predict more, also edges and uncertainties."""
 
     alpha: Array
-    """(N,) heading relative to the azimuth of the ray through the box's centre, radians in [-pi, pi)."""
+    """(N,) heading relative to the azimuth of the ray through the crop's centre, radians in [-pi, pi)."""
     flip_log_odds: Array
     """(N,) log-odds of alpha against alpha + pi."""
     dims_lwh: Array
     """(N, 3) metres."""
+    xyxy_px: Array | None = None
+    """(N, 4) extents of the vehicle in the image of the crops, px."""
+    sigma: Array | None = None
+    """(N, 8) standard deviations of ``UNCERTAIN``: radians, metres, px."""
 
 
 class Multibin:
@@ -66,12 +121,28 @@ class Multibin:
         self.spec = MultibinSpec.from_metadata(network.metadata)
         self.network = network
 
-    def estimate(self, crops: NDArray[np.uint8], cls: NDArray[np.int64]) -> MultibinEstimates:
-        """Estimates for crops (N, S, S, 3) RGB uint8 of vehicles of classes (N,). N may be 0."""
+    def estimate(self, crops: Crops, cls: NDArray[np.int64]) -> MultibinEstimates:
+        """Estimates for crops of vehicles of classes (N,). N may be 0."""
+        predicts = self.spec.sigma_scale is not None
         if len(crops) == 0:
-            return MultibinEstimates(np.zeros(0), np.zeros(0), np.zeros((0, 3)))
-        vectors, confidence, residual = self.network.run(crops)
-        return decode_multibin(vectors, confidence, residual, cls, self.spec)
+            none = (np.zeros((0, 4)), np.zeros((0, len(UNCERTAIN)))) if predicts else (None, None)
+            return MultibinEstimates(np.zeros(0), np.zeros(0), np.zeros((0, 3)), *none)
+        vectors, confidence, residual, *more = self.network.run(crops.pixels)
+        estimates = decode_multibin(vectors, confidence, residual, cls, self.spec)
+        if self.spec.sigma_scale is None:
+            return estimates
+        edges, log_sigma = more
+        sigma = np.exp(log_sigma.astype(np.float64)) * self.spec.sigma_scale
+        sigma[:, _EDGES] *= crops.window[:, 2:]
+        return replace(estimates, xyxy_px=edges_in_image(edges, crops.window), sigma=sigma)
+
+
+def edges_in_image(edges: ArrayLike, window: NDArray[np.int64]) -> Array:
+    """Boxes (N, 4) in px of edges (N, 4) given in sides of their crops' windows (N, 3) from the middle."""
+    corner, side = window[:, [0, 1, 0, 1]], window[:, 2:]
+    # Pixel centres lie at integers: a window begins half a pixel before its first one.
+    boxes: Array = corner - 0.5 + (np.asarray(edges, dtype=np.float64) + 0.5) * side
+    return boxes
 
 
 def decode_multibin(
@@ -93,14 +164,25 @@ def decode_multibin(
     )
 
 
+def cut_crops(image: NDArray[np.uint8], xyxy_px: ArrayLike, crop_px: int) -> Crops:
+    """Square crops around 2D boxes (N, 4) of an image (H, W, 3)."""
+    return Crops(crop_vehicles(image, xyxy_px, crop_px), crop_windows(xyxy_px))
+
+
+def crop_windows(xyxy_px: ArrayLike) -> NDArray[np.int64]:
+    """Square windows (N, 3: left, top, side) of the crops of 2D boxes (N, 4), px: pixels left .. left + side - 1."""
+    xyxy = np.asarray(xyxy_px, dtype=np.float64).reshape(-1, 4)
+    side = np.maximum(np.rint(CONTEXT * (xyxy[:, 2:] - xyxy[:, :2]).max(1, initial=0.0)), _MIN_WINDOW_PX)
+    corner = np.rint((xyxy[:, :2] + xyxy[:, 2:] - side[:, None]) / 2)
+    return np.concatenate([corner, side[:, None]], 1).astype(np.int64)
+
+
 def crop_vehicles(image: NDArray[np.uint8], xyxy_px: ArrayLike, crop_px: int) -> NDArray[np.uint8]:
     """Square crops (N, S, S, 3) around 2D boxes (N, 4) of an image (H, W, 3); outside the image they are grey."""
     xyxy = np.asarray(xyxy_px, dtype=np.float64).reshape(-1, 4)
     crops = np.empty((len(xyxy), crop_px, crop_px, 3), np.uint8)
     height, width = image.shape[:2]
-    for row, (x0, y0, x1, y1) in enumerate(xyxy.tolist()):
-        side = max(round(CONTEXT * max(x1 - x0, y1 - y0)), 4)
-        left, top = round((x0 + x1 - side) / 2), round((y0 + y1 - side) / 2)
+    for row, (left, top, side) in enumerate(crop_windows(xyxy).tolist()):
         inside = image[max(top, 0) : max(min(top + side, height), 0), max(left, 0) : max(min(left + side, width), 0)]
         if inside.shape[:2] != (side, side):
             square = np.full((side, side, 3), PAD_VALUE, np.uint8)

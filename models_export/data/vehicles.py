@@ -1,0 +1,108 @@
+"""Single vehicles out of images: what the multi-bin head trains on, kept as small pictures around each vehicle."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from models_export.data.dataset import Scene, open_scene
+from models_export.data.samples import Labels, label_vehicles
+from service.frames import decode
+from service.geometry.boxes import clip_extents
+from service.geometry.camera import Camera, ray_azimuth
+from service.geometry.transforms import Array, wrap_angle
+from service.nets.multibin import CONTEXT, crop_vehicles, crop_windows
+
+_ROOM = 1.5
+"""Side of the kept picture over that of an exact crop: what jitter of the box may reach."""
+_MIN_SIDE_PX = 8.0
+"""Vehicles whose 2D box is smaller in the image of the crops are left out."""
+_MAX_PATCH_PX = 176
+"""Longer sides are reduced: crops are smaller still."""
+
+
+@dataclass(frozen=True, eq=False)
+class Vehicle:
+    """One vehicle in one camera's image."""
+
+    patch: NDArray[np.uint8]
+    """(h, w, 3) RGB, a part of the image around the vehicle, perhaps reduced."""
+    patch_origin_px: Array
+    """(2,) image coordinates of the patch's upper left corner (not of its first pixel's centre)."""
+    patch_scale: Array
+    """(2,) pixels of the patch a pixel of the image, across and down."""
+    xyxy_px: Array
+    """(4,) extents of the projected box, clipped to the image, px of the image."""
+    alpha: float
+    """Heading relative to the ray through the 2D box's centre, radians."""
+    dims_lwh: Array
+    """(3,) metres."""
+    cls: int
+    """Class index."""
+    camera: Camera
+    """The camera at the image's size."""
+
+    def crop(self, xyxy_px: Array, crop_px: int) -> tuple[NDArray[np.uint8], float, Array]:
+        """What the head would see and should say of a box (4,) that is not exact.
+
+        Returns the crop (S, S, 3), alpha about that box's centre, and the true edges (4,) in the crop's sides from its middle.
+        """
+        centers = np.stack([(self.xyxy_px[:2] + self.xyxy_px[2:]) / 2, (xyxy_px[:2] + xyxy_px[2:]) / 2])
+        azimuth = ray_azimuth(self.camera, centers)
+        alpha = float(wrap_angle(self.alpha + azimuth[0] - azimuth[1]))
+        origin = np.tile(self.patch_origin_px, 2)
+        in_patch = (np.stack([xyxy_px, self.xyxy_px]) + 0.5 - origin) * np.tile(self.patch_scale, 2) - 0.5
+        crop = crop_vehicles(self.patch, in_patch[:1], crop_px)[0]
+        left, top, side = crop_windows(in_patch[:1])[0].astype(np.float64)
+        edges = (in_patch[1] + 0.5 - np.array([left, top] * 2)) / side - 0.5
+        return crop, alpha, edges
+
+
+def load_vehicles(scenes: Iterable[Path], classes: tuple[str, ...], max_width: int) -> list[Vehicle]:
+    """All vehicles of scenes that a detector is asked for, out of images of at most ``max_width`` px."""
+    found: list[Vehicle] = []
+    for path in scenes:
+        scene = open_scene(path)
+        for step in range(scene.steps):
+            for index, camera in enumerate(scene.site.cameras):
+                found.extend(_vehicles_of(scene, step, index, camera, classes, max_width))
+    return found
+
+
+def _vehicles_of(
+    scene: Scene, step: int, index: int, camera: Camera, classes: tuple[str, ...], max_width: int
+) -> Iterator[Vehicle]:
+    image = decode(scene.frame_bytes(camera.id, step), camera, max_width)
+    scaled = camera.scaled(image.shape[1], image.shape[0])
+    labels = label_vehicles(scene.truth(step), index, scaled, classes, _MIN_SIDE_PX)
+    yield from cut_vehicles(image, scaled, labels)
+
+
+def cut_vehicles(image: NDArray[np.uint8], camera: Camera, labels: Labels) -> Iterator[Vehicle]:
+    """The labelled vehicles of an image (H, W, 3) whose size is the camera's; ignored ones are left out."""
+    height, width = image.shape[:2]
+    for row in np.flatnonzero(~labels.ignore):
+        xyxy = clip_extents(camera, labels.xyxy_px[row])
+        half = 0.5 * _ROOM * CONTEXT * float((xyxy[2:] - xyxy[:2]).max())
+        center = (xyxy[:2] + xyxy[2:]) / 2
+        x0, y0 = np.maximum(np.floor(center - half), 0).astype(int)
+        x1, y1 = np.minimum(np.ceil(center + half), [width, height]).astype(int)
+        patch = image[y0:y1, x0:x1]
+        reduction = _MAX_PATCH_PX / max(patch.shape)
+        if reduction < 1:
+            patch = cv2.resize(patch, None, fx=reduction, fy=reduction, interpolation=cv2.INTER_AREA)
+        yield Vehicle(
+            patch=np.ascontiguousarray(patch),
+            patch_origin_px=np.array([x0, y0]) - 0.5,
+            patch_scale=np.array([patch.shape[1] / (x1 - x0), patch.shape[0] / (y1 - y0)]),
+            xyxy_px=xyxy,
+            alpha=float(labels.alpha[row]),
+            dims_lwh=labels.dims_lwh[row],
+            cls=int(labels.cls[row]),
+            camera=camera,
+        )
