@@ -10,21 +10,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from rich.console import Console
 from torch import nn
 
 from models_export.data.dataset import list_scenes
 from models_export.data.samples import Sample, load_samples, split_scenes
+from models_export.data.vehicles import Vehicle, load_vehicles
 from models_export.export import Exported, canvases_of, to_onnx, with_metadata, write_pack
 from models_export.nets.blocks import parameter_count
 from models_export.nets.depth import DepthConfig, EdgeDepth
 from models_export.nets.detector import DetectorConfig, EdgeDetector
 from models_export.nets.multibin import EdgeMultibin, MultibinConfig
 from models_export.quantize import quantize
+from models_export.train.checkpoint import load_averaged, read_checkpoint
+from models_export.train.config import TrainConfig
 from models_export.train.depth import DepthTask
 from models_export.train.detector import DetectorTask
-from models_export.train.loop import TrainConfig, fit, load_averaged, read_checkpoint
+from models_export.train.loop import fit
 from models_export.train.multibin import MultibinTask
 from models_export.validate import (
     depth_scores,
@@ -84,16 +88,15 @@ def train(network: str, data: Sequence[Path], out: Path, recipe: EdgeRecipe, *, 
     """
     if network not in NETWORKS:
         raise InputError(f"'{network}' is no network of this pack.", field="network", remedy=f"One of {', '.join(NETWORKS)}.")
-    training, _ = split_scenes(data)
+    training, held_out = split_scenes(data)
+    # Before the network is made: its first weights are drawn.
+    torch.manual_seed(recipe.training[network].seed)
+    if network == "multibin":
+        head = MultibinTask(_vehicles(training, recipe), recipe.multibin)
+        return fit(head, recipe.training[network], out, head.held_out(_vehicles(held_out, recipe)), resume=resume)
     samples = _load(training, recipe)
-    task: DetectorTask | MultibinTask | DepthTask
-    if network == "detector":
-        task = DetectorTask(samples, recipe.detector)
-    elif network == "multibin":
-        task = MultibinTask(samples, recipe.multibin)
-    else:
-        task = DepthTask(samples, recipe.depth)
-    return fit(task, recipe.training[network], out, resume=resume)
+    task = DetectorTask(samples, recipe.detector) if network == "detector" else DepthTask(samples, recipe.depth)
+    return fit(task, recipe.training[network], out, task.held_out(_load(held_out, recipe)), resume=resume)
 
 
 def export(runs: Path, data: Sequence[Path], out: Path, recipe: EdgeRecipe, console: Console | None = None) -> Manifest:
@@ -227,6 +230,10 @@ class _Job:
 
 def _load(scenes: list[Path], recipe: EdgeRecipe) -> list[Sample]:
     return load_samples(scenes, recipe.detector.classes, recipe.detector.max_width, recipe.depth.stride)
+
+
+def _vehicles(scenes: list[Path], recipe: EdgeRecipe) -> list[Vehicle]:
+    return load_vehicles(scenes, recipe.multibin.classes, recipe.multibin.max_width)
 
 
 def _image_batches(samples: list[Sample]) -> list[Images]:

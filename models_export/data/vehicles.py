@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from models_export.data.dataset import Scene, open_scene
+from models_export.data.dataset import UNKNOWN_CONDITION, Scene, open_scene
 from models_export.data.samples import Labels, label_vehicles
 from service.frames import decode
 from service.geometry.boxes import clip_extents
@@ -46,6 +46,13 @@ class Vehicle:
     """Class index."""
     camera: Camera
     """The camera at the image's size."""
+    weather: str = UNKNOWN_CONDITION
+    """Light and weather of the scene: day, night, fog, ..."""
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """What validation tells vehicles apart by."""
+        return {"camera": self.camera.id, "weather": self.weather}
 
     def crop(self, xyxy_px: Array, crop_px: int) -> tuple[NDArray[np.uint8], float, Array]:
         """What the head would see and should say of a box (4,) that is not exact.
@@ -80,10 +87,12 @@ def _vehicles_of(
     image = decode(scene.frame_bytes(camera.id, step), camera, max_width)
     scaled = camera.scaled(image.shape[1], image.shape[0])
     labels = label_vehicles(scene.truth(step), index, scaled, classes, _MIN_SIDE_PX)
-    yield from cut_vehicles(image, scaled, labels)
+    yield from cut_vehicles(image, scaled, labels, scene.condition)
 
 
-def cut_vehicles(image: NDArray[np.uint8], camera: Camera, labels: Labels) -> Iterator[Vehicle]:
+def cut_vehicles(
+    image: NDArray[np.uint8], camera: Camera, labels: Labels, weather: str = UNKNOWN_CONDITION
+) -> Iterator[Vehicle]:
     """The labelled vehicles of an image (H, W, 3) whose size is the camera's; ignored ones are left out."""
     height, width = image.shape[:2]
     for row in np.flatnonzero(~labels.ignore):
@@ -105,4 +114,5 @@ def cut_vehicles(image: NDArray[np.uint8], camera: Camera, labels: Labels) -> It
             dims_lwh=labels.dims_lwh[row],
             cls=int(labels.cls[row]),
             camera=camera,
+            weather=weather,
         )

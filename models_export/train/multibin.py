@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from models_export.data.augment import AugmentConfig, photometric
+from models_export.data.augment import NO_AUGMENT, AugmentConfig, photometric
 from models_export.data.vehicles import Vehicle
 from models_export.losses import likelihood_loss, multibin_loss
 from models_export.nets.multibin import SIGMA_UNITS, EdgeMultibin, MultibinConfig
-from models_export.train.loop import Batch
+from models_export.train.task import Batch, ParameterGroup, decayed_groups, draw_uniform
 from service.geometry.transforms import Array
 
 JITTER, MAX_JITTER = 0.06, 0.15
@@ -35,11 +37,32 @@ class MultibinTask:
         """Configuration of network, data and augmentation."""
         return {"net": asdict(self.config), "augment": asdict(self.augment), "vehicles": len(self.vehicles)}
 
-    def batch(self, rng: np.random.Generator, size: int) -> Batch:
+    def __len__(self) -> int:
+        return len(self.vehicles)
+
+    def held_out(self, vehicles: list[Vehicle]) -> MultibinTask:
+        """The same network and configuration over other vehicles, which are not augmented: for validation."""
+        other = copy(self)
+        other.vehicles, other.augment = vehicles, NO_AUGMENT
+        return other
+
+    def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.int64]:
+        """Every vehicle is as likely as the others."""
+        return draw_uniform(rng, len(self), size)
+
+    def labels(self, index: int) -> dict[str, str]:
+        """Camera and weather of a vehicle's frame."""
+        return self.vehicles[index].labels
+
+    def parameter_groups(self, net: nn.Module) -> list[ParameterGroup]:
+        """All of the network at one pace."""
+        return decayed_groups(net)
+
+    def batch(self, indices: NDArray[np.int64], rng: np.random.Generator) -> Batch:
         """Crops (N, S, S, 3) uint8, alpha (N,), size residuals (N, 3) metres, edges (N, 4) in sides of the crop."""
         crops, alphas, residuals, edges = [], [], [], []
         means = np.array(self.config.mean_dims_lwh)
-        for index in rng.integers(len(self.vehicles), size=size):
+        for index in indices:
             vehicle = self.vehicles[index]
             crop, alpha, edge = vehicle.crop(jittered(vehicle.xyxy_px, rng), self.config.crop_px)
             if rng.random() < self.augment.flip:
