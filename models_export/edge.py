@@ -44,14 +44,18 @@ from service.errors import InputError
 from service.nets.canvas import to_canvas
 from service.nets.depth import DepthNet
 from service.nets.detector import Detections, Detector
-from service.nets.multibin import Multibin, crop_vehicles
+from service.nets.multibin import UNCERTAIN, Multibin
 from service.nets.pack import Manifest, open_network
 
 NETWORKS = ("detector", "multibin", "depth")
 VERSION = "1"
 _CALIBRATION_SCENES, _CALIBRATION_IMAGES = 24, 96
-_PARITY_IMAGES = 4
-_OUTPUTS = {"detector": ("p8", "p16", "p32"), "multibin": ("vectors", "confidence", "residual"), "depth": ("inverse_depth",)}
+_PARITY_IMAGES, _PARITY_BATCHES = 4, 4
+_OUTPUTS = {
+    "detector": ("p8", "p16", "p32"),
+    "multibin": ("vectors", "confidence", "residual", "edges", "log_sigma"),
+    "depth": ("inverse_depth",),
+}
 # Stand in the metadata only until validation has measured the real ones.
 _SIGMA_UNKNOWN: dict[str, Any] = {
     "edge_px": [1.0, 0.02, 0.0, 1.0],
@@ -130,6 +134,8 @@ class _Job:
     """Validation frames."""
     calibration: list[Sample]
     """Training frames whose activations set the int8 ranges."""
+    calibration_scenes: list[Path]
+    """The scenes that they come from."""
     scores: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
 
@@ -137,7 +143,9 @@ class _Job:
     def load(runs: Path, training: list[Path], validation: list[Path], recipe: EdgeRecipe) -> _Job:
         some = training[:: max(len(training) // _CALIBRATION_SCENES, 1)][:_CALIBRATION_SCENES]
         calibration = _load(some, recipe)
-        return _Job(runs, recipe, _load(validation, recipe), calibration[:: max(len(calibration) // _CALIBRATION_IMAGES, 1)])
+        return _Job(
+            runs, recipe, _load(validation, recipe), calibration[:: max(len(calibration) // _CALIBRATION_IMAGES, 1)], some
+        )
 
     def detector(self) -> tuple[Exported, list[Detections]]:
         saved = self._checkpoint("detector")
@@ -167,14 +175,17 @@ class _Job:
             "mean_dims_lwh": config.mean_dims_lwh,
             "sigma_dims_lwh": _SIGMA_UNKNOWN["dims_lwh"],
             "sigma_alpha_rad": _SIGMA_UNKNOWN["alpha_rad"],
+            "max_width": config.max_width,
+            "sigma_scale": [1.0] * len(UNCERTAIN),
         }
         side = config.crop_px
         model = to_onnx(net, "multibin", (side, side), _OUTPUTS["multibin"], dynamic_hw=False)
-        inputs, crops = _crop_batches(self.samples, side)[:4], _crop_batches(self.calibration, side)
+        crops = _crop_batches(self.calibration_scenes, self.recipe, side)
+        inputs, crops = crops[:_PARITY_BATCHES], crops[_PARITY_BATCHES:]
         model = self._checked(net, "multibin", model, metadata, inputs, crops)
         head = Multibin(open_network("multibin", with_metadata(model, metadata)))
         measured = multibin_scores(head, match_all(found, self.samples))
-        metadata |= {key: measured[key] for key in ("sigma_dims_lwh", "sigma_alpha_rad")}
+        metadata |= {key: measured[key] for key in ("sigma_dims_lwh", "sigma_alpha_rad", "sigma_scale")}
         self.scores["multibin"] |= measured
         return self._exported("multibin", model, metadata, net)
 
@@ -243,8 +254,8 @@ def _image_batches(samples: list[Sample]) -> list[Images]:
     return [np.stack([to_canvas(image) for image in images]), np.stack(cut)]
 
 
-def _crop_batches(samples: list[Sample], side: int, batch: int = 32) -> list[Images]:
-    crops = np.concatenate([crop_vehicles(image_of(s), s.xyxy_px[~s.ignore], side) for s in samples])
+def _crop_batches(scenes: list[Path], recipe: EdgeRecipe, side: int, batch: int = 32) -> list[Images]:
+    crops = np.stack([vehicle.crop(vehicle.xyxy_px, side)[0] for vehicle in _vehicles(scenes, recipe)])
     return [crops[i : i + batch] for i in range(0, len(crops) - batch + 1, batch)]
 
 

@@ -17,13 +17,13 @@ from models_export.data.samples import Sample
 from service.depth_scale import DepthScale, fit_scale, ground_inverse_depth, read_boxes
 from service.errors import InputError
 from service.geometry.boxes import cut_edges
-from service.geometry.camera import ray_azimuth
+from service.geometry.camera import Camera, ray_azimuth
 from service.geometry.iou import iou_2d
 from service.geometry.transforms import Array, wrap_angle
 from service.nets.depth import UNBIASED, DepthNet, InverseDepth
 from service.nets.detector import Detections, Detector, box_size
 from service.nets.error_model import ErrorModel
-from service.nets.multibin import Multibin, crop_vehicles
+from service.nets.multibin import Multibin, cut_crops
 
 SCORE_FLOOR = 0.05
 """Detections below do not enter the precision-recall curve."""
@@ -151,32 +151,76 @@ def edge_errors(matches: Sequence[Matched]) -> ErrorModel:
 
 
 def multibin_scores(multibin: Multibin, matches: Sequence[Matched]) -> dict[str, Any]:
-    """Errors of angle and size on detected boxes: medians, flips, and the error models that lifting uses."""
-    angle, size, flipped = [np.zeros(0)], [np.zeros((0, 3))], [np.zeros(0, dtype=bool)]
-    for m in matches:
-        sample = m.sample
-        estimate = multibin.estimate(crop_vehicles(image_of(sample), m.xyxy_px, multibin.spec.crop_px), sample.cls[m.truth])
-        heading = sample.alpha[m.truth] + _azimuth(sample, sample.xyxy_px[m.truth])
-        error = wrap_angle(estimate.alpha + _azimuth(sample, m.xyxy_px) - heading)
-        flip = np.abs(error) > np.pi / 2
-        flipped.append(flip)
-        angle.append(np.abs(wrap_angle(error + np.pi * flip)))
-        size.append(estimate.dims_lwh - sample.dims_lwh[m.truth])
-    angles, sizes, score = np.concatenate(angle), np.concatenate(size), np.concatenate([m.score for m in matches])
-    is_cut = np.concatenate([cut_edges(m.sample.camera, m.xyxy_px).any(1) for m in matches])
-    return {
+    """Errors of angle and size on detected boxes: medians, flips, and the error models that lifting uses.
+
+    Of a head that predicts edges and standard deviations, also the edges' errors and ``sigma_scale``: what makes the predicted
+    deviations cover 68 % of the errors.
+    """
+    rows = [_head_errors(multibin, m) for m in matches if len(m.truth)]
+    error, sigma = np.concatenate([row.error for row in rows]), np.concatenate([row.sigma for row in rows])
+    flipped, is_cut = np.concatenate([row.flipped for row in rows]), np.concatenate([row.is_cut for row in rows])
+    score = np.concatenate([row.score for row in rows])
+    angles, sizes, edges = np.abs(error[:, 0]), error[:, 1:4], np.abs(error[:, 4:])
+    scores = {
         "vehicles": len(angles),
         "angle_median_deg": round(float(np.degrees(np.median(angles))), 3),
         "angle_p90_deg": round(float(np.degrees(np.percentile(angles, 90))), 3),
-        "flips_percent": round(100 * float(np.mean(np.concatenate(flipped))), 3),
+        "flips_percent": round(100 * float(np.mean(flipped)), 3),
         "size_rmse_lwh_m": np.sqrt((sizes**2).mean(0)).round(4).tolist(),
         "sigma_alpha_rad": fit_error_model(angles, score, is_cut).to_metadata(),
         "sigma_dims_lwh": [fit_error_model(np.abs(sizes[:, axis]), score, is_cut).to_metadata() for axis in range(3)],
     }
+    if multibin.spec.sigma_scale is None:
+        return scores
+    ratio = np.where(np.isfinite(error), np.abs(error) / sigma, np.nan)
+    return scores | {
+        "edge_median_px": round(float(np.nanmedian(edges)), 3),
+        "edge_p90_px": round(float(np.nanpercentile(edges, 90)), 3),
+        "sigma_scale": np.nanpercentile(ratio, _NORMAL_68, axis=0).round(4).tolist(),
+    }
 
 
-def _azimuth(sample: Sample, xyxy_px: Array) -> Array:
-    return ray_azimuth(sample.camera, (xyxy_px[:, :2] + xyxy_px[:, 2:]) / 2)
+@dataclass(frozen=True, eq=False)
+class _HeadErrors:
+    """What the head says of M matched detections, less the truth."""
+
+    error: Array
+    """(M, 8) in the order of ``UNCERTAIN``: radians (flips aside), metres, px; NaN for edges that are cut, or not read."""
+    sigma: Array
+    """(M, 8) predicted standard deviations; ones where the head predicts none."""
+    flipped: NDArray[np.bool_]
+    is_cut: NDArray[np.bool_]
+    score: Array
+
+
+def _head_errors(multibin: Multibin, m: Matched) -> _HeadErrors:
+    sample, spec = m.sample, multibin.spec
+    image, camera = image_of(sample), sample.camera
+    if spec.max_width is not None and sample.still is not None:
+        image, camera = sample.still.at(spec.max_width)
+    factor = np.array([image.shape[1] / sample.image_size[0], image.shape[0] / sample.image_size[1]])
+    detected, truth = (_enlarged(xyxy, factor) for xyxy in (m.xyxy_px, sample.xyxy_px[m.truth]))
+    estimate = multibin.estimate(cut_crops(image, detected, spec.crop_px), sample.cls[m.truth])
+    turn = wrap_angle(estimate.alpha + _azimuth(camera, detected) - sample.alpha[m.truth] - _azimuth(camera, truth))
+    flip = np.abs(turn) > np.pi / 2
+    cut = cut_edges(camera, detected)
+    edges = np.full((len(m.truth), 4), np.nan)
+    if estimate.xyxy_px is not None:
+        edges = np.where(cut, np.nan, estimate.xyxy_px - truth)
+    angle = wrap_angle(turn + np.pi * flip)
+    error = np.concatenate([angle[:, None], estimate.dims_lwh - sample.dims_lwh[m.truth], edges], 1)
+    sigma = np.ones_like(error) if estimate.sigma is None else estimate.sigma
+    return _HeadErrors(error, sigma, flip, cut.any(1), m.score)
+
+
+def _enlarged(xyxy_px: Array, factor: Array) -> Array:
+    """Boxes (N, 4) in an image ``factor`` (2,) times as large; pixel centres at integers."""
+    larger: Array = (xyxy_px + 0.5) * np.tile(factor, 2) - 0.5
+    return larger
+
+
+def _azimuth(camera: Camera, xyxy_px: Array) -> Array:
+    return ray_azimuth(camera, (xyxy_px[:, :2] + xyxy_px[:, 2:]) / 2)
 
 
 def depth_scores(depth: DepthNet, samples: Sequence[Sample], matches: Sequence[Matched]) -> dict[str, float]:

@@ -168,7 +168,7 @@ def reduced(image: UInt8Image, max_width: int) -> UInt8Image:
     factor = -(-width // max_width)
     if factor == 1:
         return image
-    size = (round(width / factor), round(height / factor))
+    size = (max(width // factor, 1), max(round(height / factor), 1))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 

@@ -97,7 +97,9 @@ class Pipeline:
         images = [np.full((height, width, 3), 114, np.uint8)] * 4
         self.detector.detect(images)
         self.depth.infer(images)
-        self.multibin.estimate(cut_crops(images[0], [[0.0, 0.0, 20.0, 20.0]], self.multibin.spec.crop_px), np.zeros(1, np.int64))
+        self.multibin.estimate(
+            cut_crops(images[0], [[0.0, 0.0, 20.0, 20.0]], self.multibin.spec.crop_px), np.zeros(1, np.int64)
+        )
 
     def run(self, frame_set: FrameSet) -> SetResult:
         """All steps for one set. Raises the first FrameError when not one frame can be decoded."""

@@ -34,6 +34,21 @@ VALIDATION_EVERY = 10
 
 
 @dataclass(frozen=True, eq=False)
+class Still:
+    """A frame as it came from its camera."""
+
+    data: bytes
+    """A JPEG."""
+    camera: Camera
+    """The camera at the frame's own size."""
+
+    def at(self, max_width: int) -> tuple[NDArray[np.uint8], Camera]:
+        """The image (H, W, 3) RGB, at most ``max_width`` px wide, and the camera at its size."""
+        image = decode(self.data, self.camera, max_width)
+        return image, self.camera.scaled(image.shape[1], image.shape[0])
+
+
+@dataclass(frozen=True, eq=False)
 class Sample:
     """One camera's frame."""
 
@@ -63,6 +78,9 @@ class Sample:
     """(h, w) 1 / metres at the depth net's stride; 0 where the depth is unknown."""
     weather: str = UNKNOWN_CONDITION
     """Light and weather of the scene: day, night, fog, ..."""
+
+    still: Still | None = None
+    """The frame, for those who want it larger than the detector does; None for made-up samples."""
 
     @property
     def labels(self) -> dict[str, str]:
@@ -98,8 +116,8 @@ def load_samples(scenes: Iterable[Path], classes: tuple[str, ...], max_width: in
 def _load_sample(
     scene: Scene, step: int, camera_index: int, camera: Camera, classes: tuple[str, ...], max_width: int, depth_stride: int
 ) -> Sample:
-    image = decode(scene.frame_bytes(camera.id, step), camera, max_width)
-    scaled = camera.scaled(image.shape[1], image.shape[0])
+    still = Still(scene.frame_bytes(camera.id, step), camera)
+    image, scaled = still.at(max_width)
     labels = label_vehicles(scene.truth(step), camera_index, scaled, classes)
     return Sample(
         canvas=to_canvas(image),
@@ -108,6 +126,7 @@ def _load_sample(
         ground=scene.site.ground,
         inverse_depth=_inverse_depth(scene.depth(camera.id, step), to_canvas(image).shape[:2], image.shape[:2], depth_stride),
         weather=scene.condition,
+        still=still,
         **vars(labels),
     )
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models_export.data.dataset import UNKNOWN_CONDITION, Scene, open_scene
-from models_export.data.samples import Labels, label_vehicles
+from models_export.data.samples import Labels, Sample, label_vehicles
 from service.frames import decode
 from service.geometry.boxes import clip_extents
 from service.geometry.camera import Camera, ray_azimuth
@@ -90,8 +90,14 @@ def _vehicles_of(
     yield from cut_vehicles(image, scaled, labels, scene.condition)
 
 
+def vehicles_of(sample: Sample) -> list[Vehicle]:
+    """The vehicles of a sample, out of its canvas: no larger than the detector sees them."""
+    width, height = sample.image_size
+    return list(cut_vehicles(sample.canvas[:height, :width], sample.camera, sample, sample.weather))
+
+
 def cut_vehicles(
-    image: NDArray[np.uint8], camera: Camera, labels: Labels, weather: str = UNKNOWN_CONDITION
+    image: NDArray[np.uint8], camera: Camera, labels: Labels | Sample, weather: str = UNKNOWN_CONDITION
 ) -> Iterator[Vehicle]:
     """The labelled vehicles of an image (H, W, 3) whose size is the camera's; ignored ones are left out."""
     height, width = image.shape[:2]

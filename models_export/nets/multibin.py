@@ -13,7 +13,7 @@ from models_export.nets.blocks import Normalise, conv, stage
 from service.nets.multibin import UNCERTAIN
 
 SIGMA_UNITS = (0.05, 0.1, 0.1, 0.1, 0.01, 0.01, 0.01, 0.01)
-"""Usual errors of ``UNCERTAIN``, in which they are counted while training, so that all weigh alike: rad, m, sides of the crop."""
+"""Usual errors of ``UNCERTAIN``: training counts in them, so that all weigh alike. Radians, metres, sides of the crop."""
 _MIN_LOG, _MAX_LOG = -3.0, 4.0
 """Limits of the predicted logarithms over those units."""
 
@@ -58,7 +58,12 @@ class EdgeMultibin(nn.Module):
         self.bins = len(config.bin_centers_rad)
         self.normalise = Normalise()
         self.trunk = nn.Sequential(
-            conv(3, c1, 3, 2), stage(c1, c2, r2), stage(c2, c3, r3), stage(c3, c4, r4), conv(c4, config.squeezed, 1), nn.Flatten()
+            conv(3, c1, 3, 2),
+            stage(c1, c2, r2),
+            stage(c2, c3, r3),
+            stage(c3, c4, r4),
+            conv(c4, config.squeezed, 1),
+            nn.Flatten(),
         )
         features = config.squeezed * (config.crop_px // 16) ** 2
         self.orientation = self._branch(features, 2 * self.bins)

@@ -80,10 +80,10 @@ class MultibinTask:
         vectors, confidence, residual, edges, log_sigma = (out.float() for out in net(batch["crops"]))
         centers = torch.tensor(self.config.bin_centers_rad, device=vectors.device)
         alpha = batch["alpha"]
-        paper = multibin_loss(
-            vectors, confidence, residual, alpha, batch["residuals"], centers, self.config.bin_overlap_rad
+        paper = multibin_loss(vectors, confidence, residual, alpha, batch["residuals"], centers, self.config.bin_overlap_rad)
+        errors = torch.cat(
+            [angle_error(vectors, alpha, centers)[:, None], residual - batch["residuals"], edges - batch["edges"]], 1
         )
-        errors = torch.cat([angle_error(vectors, alpha, centers)[:, None], residual - batch["residuals"], edges - batch["edges"]], 1)
         units = torch.tensor(SIGMA_UNITS, device=errors.device)
         terms = likelihood_loss(errors / units, log_sigma - units.log()).mean(0)
         likelihood = {"angle_nll": terms[0], "size_nll": terms[1:4].mean(), "edge_nll": terms[4:].mean()}

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from models_export.data.samples import Sample
+from models_export.data.vehicles import Vehicle, vehicles_of
 from service.geometry.camera import Camera
 from service.geometry.ground import GroundPlane
 from service.geometry.transforms import pole_camera_pose
@@ -20,6 +21,12 @@ def toy_samples() -> list[Sample]:
     K = np.array([[120.0, 0.0, 79.5], [0.0, 120.0, 47.5], [0.0, 0.0, 1.0]])
     camera = Camera("north", WIDTH, HEIGHT, K, pole_camera_pose([0.0, 0.0, 6.0], 0.0, 0.3))
     return [_toy_sample(rng, camera) for _ in range(8)]
+
+
+@pytest.fixture(scope="session")
+def toy_vehicles(toy_samples: list[Sample]) -> list[Vehicle]:
+    """The vehicles of the toy samples."""
+    return [vehicle for sample in toy_samples for vehicle in vehicles_of(sample)]
 
 
 def _toy_sample(rng: np.random.Generator, camera: Camera) -> Sample:

@@ -9,7 +9,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models_export.losses import align, ciou, depth_loss, gradient_matching_loss, multibin_loss, trimmed_ssi_loss
+from models_export.losses import (
+    align,
+    ciou,
+    depth_loss,
+    gradient_matching_loss,
+    likelihood_loss,
+    multibin_loss,
+    trimmed_ssi_loss,
+)
 
 CENTERS = torch.tensor([0.0, math.pi])
 
@@ -74,6 +82,29 @@ def test_angle_in_the_overlap_trains_both_bins() -> None:
     spoiled[:, 0] = -spoiled[:, 0]
     losses = multibin_loss(spoiled, confidence, torch.zeros(1, 3), alpha, torch.zeros(1, 3), CENTERS, 0.1)
     assert losses["angle"].item() == pytest.approx(1.0, abs=1e-5)
+
+
+@given(error=st.floats(0.01, 10), beta=st.sampled_from([0.0, 0.5, 1.0]))
+def test_the_best_sigma_is_the_size_of_the_error(error: float, beta: float) -> None:
+    log_sigma = torch.tensor([math.log(error)], requires_grad=True)
+    likelihood_loss(torch.tensor([error]), log_sigma, beta).sum().backward()
+    assert log_sigma.grad is not None
+    assert log_sigma.grad.item() == pytest.approx(0.0, abs=1e-4 * max(error**2, 1.0))
+
+
+def test_likelihood_of_a_known_error() -> None:
+    # Two sigmas off: half of 2 squared, plus the logarithm of sigma 1/2; with beta 1/2 all of it times sigma.
+    value = likelihood_loss(torch.tensor([1.0]), torch.tensor([math.log(0.5)]), beta=0.0)
+    assert value.item() == pytest.approx(2.0 - math.log(2.0), abs=1e-6)
+    half = likelihood_loss(torch.tensor([1.0]), torch.tensor([math.log(0.5)]))
+    assert half.item() == pytest.approx(0.5 * (2.0 - math.log(2.0)), abs=1e-6)
+
+
+def test_beta_one_trains_the_error_like_squares() -> None:
+    error = torch.tensor([0.3, 2.0], requires_grad=True)
+    likelihood_loss(error, torch.tensor([-2.0, 1.5]), beta=1.0).sum().backward()
+    assert error.grad is not None
+    assert torch.allclose(error.grad, error.detach(), atol=1e-6)
 
 
 @given(scale=st.floats(0.1, 10), shift=st.floats(-5, 5), seed=st.integers(0, 100))

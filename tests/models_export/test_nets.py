@@ -12,6 +12,7 @@ from models_export.nets.multibin import EdgeMultibin, MultibinConfig
 from models_export.train.detector import assign, decode, detector_loss
 from service.nets.detector import DetectorSpec, decode_heads
 from service.nets.error_model import ErrorModel
+from service.nets.multibin import UNCERTAIN
 
 CONFIG = DetectorConfig()
 
@@ -31,11 +32,13 @@ def test_an_untrained_detector_is_quiet() -> None:
 
 
 def test_multibin_vectors_have_length_one() -> None:
-    crops = torch.randint(0, 255, (5, 64, 64, 3), dtype=torch.uint8)
-    vectors, confidence, residual = EdgeMultibin(MultibinConfig()).eval()(crops)
+    crops = torch.randint(0, 255, (5, 96, 96, 3), dtype=torch.uint8)
+    vectors, confidence, residual, edges, log_sigma = EdgeMultibin(MultibinConfig()).eval()(crops)
     assert torch.allclose(vectors.norm(dim=-1), torch.ones(5, 2), atol=1e-4)
     assert confidence.shape == (5, 2)
     assert residual.shape == (5, 3)
+    assert edges.shape == (5, 4)
+    assert log_sigma.shape == (5, len(UNCERTAIN))
 
 
 def test_depth_gives_an_eighth_of_any_canvas() -> None:

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.errors import FrameError, TooLargeError
-from service.frames import FrameLimits, check_frame, decode, decoded_size, read_header
+from service.frames import FrameLimits, check_frame, decode, decoded_size, read_header, reduced
 from service.geometry.camera import Camera
 
 LIMITS = FrameLimits()
@@ -156,3 +156,18 @@ def test_a_pixel_stays_where_the_scaled_camera_expects_it() -> None:
     u_full = 2 * np.arange(20, 620) + 0.5
     expected = np.interp(u_full, np.arange(1284), full[100, :, 0])
     assert np.abs(image[50, 20:620, 0] - expected).mean() < 1.0
+
+
+@given(width=st.integers(1, 700), height=st.integers(1, 40), max_width=st.integers(1, 300))
+def test_a_reduced_picture_is_narrow_enough_and_keeps_its_mean(width: int, height: int, max_width: int) -> None:
+    image = np.random.default_rng(width).integers(0, 255, (height, width, 3), dtype=np.uint8)
+    small = reduced(image, max_width)
+    assert small.shape[1] <= max_width
+    if width <= max_width:
+        assert small is image
+
+
+def test_halving_is_a_mean_of_four() -> None:
+    image = np.arange(2 * 4 * 3, dtype=np.uint8).reshape(2, 4, 3)
+    expected = image.reshape(1, 2, 2, 2, 3).mean((1, 3))
+    np.testing.assert_allclose(reduced(image, 2), expected, atol=0.5)

@@ -54,3 +54,8 @@ def test_edge_sigma_grows_with_the_box() -> None:
 def test_incomplete_metadata_is_refused() -> None:
     with pytest.raises(PackError, match="anchors_px"):
         DetectorSpec.from_metadata({"classes": ["car"], "strides": [8]})
+
+
+def test_scaling_keeps_what_lies_between_pixels() -> None:
+    whole = Detections(np.array([[-0.5, -0.5, 9.5, 4.5]]), np.ones(1), np.zeros(1, np.int64))
+    np.testing.assert_allclose(whole.scaled((2.0, 3.0)).xyxy_px, [[-0.5, -0.5, 19.5, 14.5]])

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from service.errors import PackError
 from service.nets.error_model import ErrorModel
-from service.nets.multibin import MultibinSpec, crop_vehicles, decode_multibin
+from service.nets.multibin import UNCERTAIN, MultibinSpec, crop_vehicles, crop_windows, decode_multibin, edges_in_image
 
 SPEC = MultibinSpec(
     64, np.array([0.0, np.pi]), np.array([[4.4, 1.8, 1.5]]), (ErrorModel(0.2, 0, 0, 1),) * 3, ErrorModel(0.07, 0, 0, 1)
@@ -48,3 +49,48 @@ def test_outside_the_image_a_crop_is_grey() -> None:
 
 def test_no_boxes_give_no_crops() -> None:
     assert crop_vehicles(np.zeros((50, 50, 3), np.uint8), np.zeros((0, 4)), 32).shape == (0, 32, 32, 3)
+
+
+@given(x=st.floats(-300, 900), y=st.floats(-300, 500), width=st.floats(0, 400), height=st.floats(0, 300))
+def test_a_window_is_square_around_its_box_with_a_margin(x: float, y: float, width: float, height: float) -> None:
+    left, top, side = crop_windows([[x, y, x + width, y + height]])[0]
+    assert side >= max(width, height)
+    assert side == max(round(1.2 * max(width, height)), 4)
+    assert abs(left + side / 2 - (x + width / 2)) <= 0.5
+    assert abs(top + side / 2 - (y + height / 2)) <= 0.5
+
+
+@given(x=st.floats(0, 500), y=st.floats(0, 300), width=st.floats(5, 200), height=st.floats(5, 150))
+def test_edges_come_back_from_the_crop_to_the_image(x: float, y: float, width: float, height: float) -> None:
+    box = np.array([[x, y, x + width, y + height]])
+    window = crop_windows(box)
+    in_crop = (box + 0.5 - window[:, [0, 1, 0, 1]]) / window[:, 2:] - 0.5
+    np.testing.assert_allclose(edges_in_image(in_crop, window), box, atol=1e-9)
+
+
+def test_the_outermost_edges_of_a_crop_lie_between_pixels() -> None:
+    np.testing.assert_allclose(edges_in_image([[-0.5, -0.5, 0.5, 0.5]], np.array([[10, 20, 8]])), [[9.5, 19.5, 17.5, 27.5]])
+
+
+def metadata(**more: object) -> dict[str, object]:
+    model = [0.1, 0.0, 0.0, 1.0]
+    base = {"crop_px": 64, "bin_centers_rad": [0.0, 3.14], "mean_dims_lwh": [[4, 2, 1.5]], "sigma_alpha_rad": model}
+    return {**base, "sigma_dims_lwh": [model] * 3, **more}
+
+
+def test_a_head_without_predicted_sigmas_is_weighed_by_its_scores() -> None:
+    spec = MultibinSpec.from_metadata(metadata())
+    assert spec.sigma_scale is None
+    estimates = decode_multibin(
+        np.zeros((2, 2, 2), "f4"), np.zeros((2, 2), "f4"), np.zeros((2, 3), "f4"), np.zeros(2, int), spec
+    )
+    alpha, dims = spec.sigmas(estimates, np.ones(2), np.zeros(2, dtype=bool))
+    assert (alpha.shape, dims.shape) == ((2,), (2, 3))
+    np.testing.assert_allclose(dims, 0.1)
+
+
+@pytest.mark.parametrize("scale", [[1.0] * 7, [0.0] * 8, [float("nan")] * 8, "much"])
+def test_scales_that_are_none_are_refused(scale: object) -> None:
+    assert MultibinSpec.from_metadata(metadata(sigma_scale=[1.0] * len(UNCERTAIN))).sigma_scale is not None
+    with pytest.raises(PackError, match="incomplete"):
+        MultibinSpec.from_metadata(metadata(sigma_scale=scale))

@@ -1,0 +1,65 @@
+"""Vehicles cut out of images: what a crop shows, and what the head should say of it."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models_export.data.samples import Labels
+from models_export.data.vehicles import Vehicle, cut_vehicles
+from models_export.train.multibin import MAX_JITTER, jittered
+from service.geometry.camera import Camera, ray_azimuth
+from service.geometry.transforms import pole_camera_pose, wrap_angle
+from service.nets.multibin import crop_windows, edges_in_image
+
+K = np.array([[300.0, 0.0, 199.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])
+CAMERA = Camera("north", 400, 240, K, pole_camera_pose([0.0, 0.0, 6.0], 0.0, 0.3))
+
+
+def white_box(xyxy: list[int]) -> Vehicle:
+    """A white rectangle on black as the only vehicle of an image."""
+    image = np.zeros((240, 400, 3), np.uint8)
+    x0, y0, x1, y1 = xyxy
+    image[y0 : y1 + 1, x0 : x1 + 1] = 255
+    one = np.ones(1)
+    labels = Labels(
+        np.array([[x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5]]), np.zeros(1, dtype=bool), np.zeros(1, np.int64), np.array([[4.0, 1.8, 1.5]]),
+        np.array([0.4]), one, 0 * one,
+    )  # fmt: skip
+    (vehicle,) = cut_vehicles(image, CAMERA, labels)
+    return vehicle
+
+
+@given(seed=st.integers(0, 10_000))
+def test_the_edges_are_where_the_crop_shows_them(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    x0, y0 = rng.integers(60, 200), rng.integers(60, 120)
+    vehicle = white_box([x0, y0, x0 + rng.integers(30, 120), y0 + rng.integers(25, 60)])
+    crop, _, edges = vehicle.crop(jittered(vehicle.xyxy_px, rng), 96)
+    white = np.argwhere(crop[..., 0] > 127)
+    shown = np.array([*(white.min(0)[::-1] - 0.5), *(white.max(0)[::-1] + 0.5)])
+    np.testing.assert_allclose(np.clip((edges + 0.5) * 96 - 0.5, -0.5, 95.5), shown, atol=1.1)
+
+
+def test_alpha_follows_the_ray_through_the_crop() -> None:
+    vehicle = white_box([100, 80, 180, 120])
+    moved = vehicle.xyxy_px + 20.0
+    alpha = vehicle.crop(moved, 64)[1]
+    centers = np.array([[140.0, 100.0], [160.0, 120.0]])
+    turn = ray_azimuth(CAMERA, centers)
+    assert abs(wrap_angle(alpha + turn[1] - vehicle.alpha - turn[0])) < 1e-9
+
+
+def test_a_large_vehicle_is_kept_small_and_its_edges_agree_with_the_service() -> None:
+    vehicle = white_box([20, 20, 380, 200])
+    assert max(vehicle.patch.shape) <= 176
+    _, _, edges = vehicle.crop(vehicle.xyxy_px, 96)
+    np.testing.assert_allclose(edges_in_image([edges], crop_windows([vehicle.xyxy_px]))[0], vehicle.xyxy_px, atol=4.0)
+
+
+@given(seed=st.integers(0, 1000))
+def test_jitter_is_bounded(seed: int) -> None:
+    box = np.array([10.0, 10.0, 50.0, 30.0])
+    moved = jittered(box, np.random.default_rng(seed))
+    assert np.abs(moved - box).max() <= MAX_JITTER * 40.0 + 1e-9
