@@ -63,7 +63,7 @@ class Vehicle:
         azimuth = ray_azimuth(self.camera, centers)
         alpha = float(wrap_angle(self.alpha + azimuth[0] - azimuth[1]))
         origin = np.tile(self.patch_origin_px, 2)
-        in_patch = (np.stack([xyxy_px, self.xyxy_px]) + 0.5 - origin) * np.tile(self.patch_scale, 2) - 0.5
+        in_patch = (np.stack([xyxy_px, self.xyxy_px]) - origin) * np.tile(self.patch_scale, 2) - 0.5
         crop = crop_vehicles(self.patch, in_patch[:1], crop_px)[0]
         left, top, side = crop_windows(in_patch[:1])[0].astype(np.float64)
         edges = (in_patch[1] + 0.5 - np.array([left, top] * 2)) / side - 0.5

@@ -22,11 +22,9 @@ def white_box(xyxy: list[int]) -> Vehicle:
     image = np.zeros((240, 400, 3), np.uint8)
     x0, y0, x1, y1 = xyxy
     image[y0 : y1 + 1, x0 : x1 + 1] = 255
-    one = np.ones(1)
-    labels = Labels(
-        np.array([[x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5]]), np.zeros(1, dtype=bool), np.zeros(1, np.int64), np.array([[4.0, 1.8, 1.5]]),
-        np.array([0.4]), one, 0 * one,
-    )  # fmt: skip
+    edges = np.array([[x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5]])
+    zero = np.zeros(1, np.int64)
+    labels = Labels(edges, zero > 0, zero, np.array([[4.0, 1.8, 1.5]]), np.array([0.4]), np.ones(1), np.zeros(1))
     (vehicle,) = cut_vehicles(image, CAMERA, labels)
     return vehicle
 
