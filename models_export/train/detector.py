@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -12,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from models_export.data.augment import AugmentConfig, flip_horizontally, photometric, rescale
-from models_export.data.samples import MIN_SIDE_PX, Sample
+from models_export.data.detection import MIN_SIDE_PX, DetectionSample
 from models_export.losses import ciou
 from models_export.nets.detector import DetectorConfig, EdgeDetector
 from models_export.train.loop import Batch
@@ -23,6 +24,8 @@ MAX_RATIO = 4.0
 """An anchor answers for a box whose sides differ from its own by less than this factor: what (2 sigmoid)^2 can reach."""
 SCALE_BALANCE = (4.0, 1.0, 0.4)
 """Weights of the objectness of the strides: fine grids hold more cells, and smaller vehicles."""
+UNKNOWN_CLASS = -1
+"""Class of a target whose class is not known."""
 BOX_WEIGHT, OBJECT_WEIGHT, CLASS_WEIGHT = 0.05, 1.0, 0.2
 
 
@@ -31,7 +34,9 @@ class DetectorTask:
 
     name = "detector"
 
-    def __init__(self, samples: list[Sample], config: DetectorConfig, augment: AugmentConfig | None = None) -> None:
+    def __init__(
+        self, samples: Sequence[DetectionSample], config: DetectorConfig, augment: AugmentConfig | None = None
+    ) -> None:
         self.samples = samples
         self.config = replace(config, anchors_px=anchors_of(samples, config.strides))
         self.augment = augment or AugmentConfig()
@@ -42,7 +47,7 @@ class DetectorTask:
         return {"net": asdict(self.config), "augment": asdict(self.augment), "samples": len(self.samples)}
 
     def batch(self, rng: np.random.Generator, size: int) -> Batch:
-        """Images (B, H, W, 3) uint8; targets (T, 7): image, class, x0, y0, x1, y1 (px), ignore."""
+        """Images (B, H, W, 3) uint8; targets (T, 7): image, class or -1, x0, y0, x1, y1 (px), ignore."""
         images, targets = [], []
         for row, index in enumerate(rng.integers(len(self.samples), size=size)):
             image, boxes = self._augmented(self.samples[index], rng)
@@ -57,7 +62,7 @@ class DetectorTask:
         """Box, objectness and class losses and their weighted sum."""
         return detector_loss([head.float() for head in net(batch["images"])], batch["targets"], self.config)
 
-    def _augmented(self, sample: Sample, rng: np.random.Generator) -> tuple[np.ndarray, Array]:
+    def _augmented(self, sample: DetectionSample, rng: np.random.Generator) -> tuple[np.ndarray, Array]:
         image, xyxy = sample.canvas, sample.xyxy_px
         if rng.random() < self.augment.flip:
             image, xyxy = flip_horizontally(image, xyxy, sample.image_size[0])
@@ -69,12 +74,13 @@ class DetectorTask:
         kept = np.prod(sides, axis=1) / np.prod(full, axis=1)
         ignore = sample.ignore | (sides.min(1, initial=np.inf) < MIN_SIDE_PX) | (kept < 0.3)
         present = sides.min(1, initial=np.inf) > 1
-        rows = np.concatenate([sample.cls[:, None], clipped, ignore[:, None]], 1)
+        cls = np.where(sample.class_known, sample.cls, UNKNOWN_CLASS)
+        rows = np.concatenate([cls[:, None], clipped, ignore[:, None]], 1)
         return photometric(image, rng, self.augment), rows[present]
 
 
 def anchors_of(
-    samples: list[Sample], strides: tuple[int, ...], per_scale: int = 3
+    samples: Sequence[DetectionSample], strides: tuple[int, ...], per_scale: int = 3
 ) -> tuple[tuple[tuple[float, float], ...], ...]:
     """Anchors (width, height), px, by k-means over the logarithms of the boxes' sides: smallest for the finest stride.
 
@@ -90,9 +96,9 @@ def anchors_of(
 def detector_loss(heads: list[Tensor], targets: Tensor, config: DetectorConfig) -> dict[str, Tensor]:
     """YOLO's loss over all scales.
 
-    heads: (B, A * (5 + C), h, w) logits a stride. targets (T, 7): image, class, x0, y0, x1, y1 (px), ignore. Complete IoU
-    for boxes; binary cross entropy for objectness, whose target is the IoU reached; cells centred in ignored boxes are
-    left out of the objectness unless they answer for a vehicle.
+    heads: (B, A * (5 + C), h, w) logits a stride. targets (T, 7): image, class or -1, x0, y0, x1, y1 (px), ignore. Complete
+    IoU for boxes; binary cross entropy for objectness, whose target is the IoU reached; cells centred in ignored boxes are
+    left out of the objectness unless they answer for a vehicle; targets of unknown class are left out of the class's loss.
     """
     positives = targets[targets[:, 6] == 0]
     ignored = targets[targets[:, 6] != 0]
@@ -107,13 +113,20 @@ def detector_loss(heads: list[Tensor], targets: Tensor, config: DetectorConfig) 
             overlap = ciou(decode(cells, index, stride, head.new_tensor(anchors)), truth[:, 2:6])
             box = box + (1 - overlap).mean()
             wanted[index] = overlap.detach().clamp(min=0).to(wanted.dtype)
-            one_hot = F.one_hot(truth[:, 1].long(), len(config.classes)).to(cells.dtype)
-            classes = classes + F.binary_cross_entropy_with_logits(cells[:, BOX_FIELDS:], one_hot)
+            classes = classes + _class_loss(cells[:, BOX_FIELDS:], truth[:, 1].long())
         blamed = ~_covered(ignored, grid.shape, stride, grid.device) | (wanted > 0)
         losses = F.binary_cross_entropy_with_logits(grid[..., 4], wanted, reduction="none")
         objectness = objectness + balance * (losses * blamed).mean()
     total = BOX_WEIGHT * box + OBJECT_WEIGHT * objectness + CLASS_WEIGHT * classes
     return {"total": total, "box": box, "objectness": objectness, "classes": classes}
+
+
+def _class_loss(logits: Tensor, cls: Tensor) -> Tensor:
+    """Mean binary cross entropy of logits (P, C) over the targets (P,) whose class is known; 0 when there are none."""
+    known = cls != UNKNOWN_CLASS
+    one_hot = F.one_hot(cls.clamp(min=0), logits.shape[1]).to(logits.dtype)
+    losses = F.binary_cross_entropy_with_logits(logits, one_hot, reduction="none").mean(1)
+    return (losses * known).sum() / known.sum().clamp(min=1)
 
 
 def assign(targets: Tensor, grid_shape: tuple[int, int], stride: int, anchors: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:

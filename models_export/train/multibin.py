@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from models_export.data.augment import AugmentConfig, photometric
-from models_export.data.samples import Sample
+from models_export.data.detection import VehicleSample
 from models_export.losses import multibin_loss
 from models_export.nets.multibin import EdgeMultibin, MultibinConfig
 from models_export.train.loop import Batch
@@ -27,7 +28,7 @@ class MultibinTask:
 
     name = "multibin"
 
-    def __init__(self, samples: list[Sample], config: MultibinConfig, augment: AugmentConfig | None = None) -> None:
+    def __init__(self, samples: Sequence[VehicleSample], config: MultibinConfig, augment: AugmentConfig | None = None) -> None:
         self.samples = samples
         self.vehicles = np.array([(i, j) for i, s in enumerate(samples) for j in np.nonzero(~s.ignore)[0]], dtype=np.int64)
         self.config = replace(config, mean_dims_lwh=mean_dims(samples, len(config.classes)))
@@ -65,7 +66,7 @@ class MultibinTask:
         )
 
 
-def mean_dims(samples: list[Sample], classes: int) -> tuple[tuple[float, float, float], ...]:
+def mean_dims(samples: Sequence[VehicleSample], classes: int) -> tuple[tuple[float, float, float], ...]:
     """Mean length, width, height of each class's vehicles, metres; a class without vehicles gets the mean of all."""
     dims = np.concatenate([s.dims_lwh[~s.ignore] for s in samples])
     cls = np.concatenate([s.cls[~s.ignore] for s in samples])
@@ -73,7 +74,7 @@ def mean_dims(samples: list[Sample], classes: int) -> tuple[tuple[float, float, 
     return tuple((float(m[0]), float(m[1]), float(m[2])) for m in (np.round(r.mean(0), 4) for r in rows))
 
 
-def _jittered(sample: Sample, row: int, rng: np.random.Generator, crop_px: int) -> tuple[np.ndarray, float]:
+def _jittered(sample: VehicleSample, row: int, rng: np.random.Generator, crop_px: int) -> tuple[np.ndarray, float]:
     """A crop around a jittered box, and alpha about the jittered centre's ray."""
     xyxy = sample.xyxy_px[row]
     sides = np.tile(xyxy[2:] - xyxy[:2], 2)
