@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from rich.console import Console
 from torch import nn
@@ -22,9 +23,11 @@ from models_export.nets.depth import DepthConfig, EdgeDepth
 from models_export.nets.detector import DetectorConfig, EdgeDetector
 from models_export.nets.multibin import EdgeMultibin, MultibinConfig
 from models_export.quantize import quantize
+from models_export.train.checkpoint import load_averaged, read_checkpoint
+from models_export.train.config import TrainConfig
 from models_export.train.depth import DepthTask
 from models_export.train.detector import DetectorTask
-from models_export.train.loop import TrainConfig, fit, load_averaged, read_checkpoint
+from models_export.train.loop import fit
 from models_export.train.multibin import MultibinTask
 from models_export.validate import (
     depth_scores,
@@ -84,8 +87,10 @@ def train(network: str, data: Sequence[Path], out: Path, recipe: EdgeRecipe, *, 
     """
     if network not in NETWORKS:
         raise InputError(f"'{network}' is no network of this pack.", field="network", remedy=f"One of {', '.join(NETWORKS)}.")
-    training, _ = split_scenes(data)
+    training, held_out = split_scenes(data)
     samples = _load(training, recipe)
+    # Before the network is made: its first weights are drawn.
+    torch.manual_seed(recipe.training[network].seed)
     task: DetectorTask | MultibinTask | DepthTask
     if network == "detector":
         task = DetectorTask(samples, recipe.detector)
@@ -93,7 +98,7 @@ def train(network: str, data: Sequence[Path], out: Path, recipe: EdgeRecipe, *, 
         task = MultibinTask(samples, recipe.multibin)
     else:
         task = DepthTask(samples, recipe.depth)
-    return fit(task, recipe.training[network], out, resume=resume)
+    return fit(task, recipe.training[network], out, task.held_out(_load(held_out, recipe)), resume=resume)
 
 
 def export(runs: Path, data: Sequence[Path], out: Path, recipe: EdgeRecipe, console: Console | None = None) -> Manifest:

@@ -41,7 +41,12 @@ class DetectionSample:
     class_known: NDArray[np.bool_]
     """(N,) whether ``cls`` means anything."""
     source: str
-    """The data set, and the clip or camera within it."""
+    """The data set, and the clip or camera within it: ``set/clip``."""
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """What validation tells pictures apart by."""
+        return {"source": self.source}
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from models_export.data.dataset import Scene, list_scenes, open_scene
+from models_export.data.dataset import UNKNOWN_CONDITION, Scene, list_scenes, open_scene
 from models_export.data.detection import MIN_SIDE_PX, VEHICLES, VehicleSample, class_columns
 from service.errors import InputError
 from service.frames import decode
@@ -20,6 +20,8 @@ from service.geometry.ground import Ground
 from service.geometry.transforms import Array, wrap_angle
 from service.nets.canvas import to_canvas
 
+SIMULATED = "simulated"
+"""The first part of the source of a scene's frames."""
 MIN_VISIBLE = 0.3
 """Vehicles of which less is visible are neither positives nor negatives."""
 MAX_TRUNCATED = 0.7
@@ -42,6 +44,13 @@ class Sample(VehicleSample):
     """The scene's road."""
     inverse_depth: NDArray[np.float32]
     """(h, w) 1 / metres at the depth net's stride; 0 where the depth is unknown."""
+    weather: str = UNKNOWN_CONDITION
+    """Light and weather of the scene: day, night, fog, ..."""
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """What validation tells frames apart by."""
+        return {"camera": self.camera.id, "weather": self.weather}
 
 
 def split_scenes(roots: Iterable[Path]) -> tuple[list[Path], list[Path]]:
@@ -91,13 +100,14 @@ def _load_sample(
         ignore=ignore,
         cls=cls,
         class_known=known,
-        source=f"{scene.world}/{camera.id}",
+        source=f"{SIMULATED}/{scene.world}",
         dims_lwh=truth.dims_lwh[seen],
         alpha=wrap_angle(truth.yaw[seen] - ray_azimuth(scaled, (xyxy[:, :2] + xyxy[:, 2:]) / 2)),
         visible=visible,
         truncated=truncated,
         ground=scene.site.ground,
         inverse_depth=_inverse_depth(scene.depth(camera.id, step), to_canvas(image).shape[:2], image.shape[:2], depth_stride),
+        weather=scene.condition,
     )
 
 
