@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -13,6 +14,8 @@ from service.geometry.transforms import Array
 from service.nets.canvas import PAD_VALUE
 
 Image = NDArray[np.uint8]
+
+_NOISE_BANK = 2**23
 
 
 @dataclass(frozen=True)
@@ -90,12 +93,23 @@ def photometric(image: Image, rng: np.random.Generator, config: AugmentConfig) -
         pixels = cv2.GaussianBlur(pixels, (0, 0), rng.uniform(0.4, 1.0))
     if rng.random() < config.noise:
         sigma = rng.uniform(1.0, config.noise_sigma)
-        noise = (sigma * rng.standard_normal(pixels.shape, dtype=np.float32)).astype(np.int16)
-        pixels = cv2.add(pixels, noise, dtype=cv2.CV_8U)
+        pixels = cv2.add(pixels, unit_noise(pixels.shape, rng) * np.float32(sigma), dtype=cv2.CV_8U)
     if rng.random() < config.jpeg:
         quality = int(rng.integers(*config.jpeg_quality, endpoint=True))
         pixels = simplejpeg.decode_jpeg(simplejpeg.encode_jpeg(np.ascontiguousarray(pixels), quality), "RGB")
     return np.asarray(pixels, dtype=np.uint8)
+
+
+def unit_noise(shape: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float32]:
+    """Normal noise of unit variance, a random part of a fixed field of eight million numbers."""
+    start = int(rng.integers(_NOISE_BANK - int(np.prod(shape)), endpoint=True))
+    return _noise_bank()[start : start + int(np.prod(shape))].reshape(shape)
+
+
+@cache
+def _noise_bank() -> NDArray[np.float32]:
+    """Unit noise to take parts of: drawing a million normal numbers an image takes longer than all else together."""
+    return np.random.default_rng(0).standard_normal(_NOISE_BANK, dtype=np.float32)
 
 
 def darkened(image: Image, gain: float) -> Image:
@@ -107,8 +121,9 @@ def darkened(image: Image, gain: float) -> Image:
 
 def veiled(image: Image, opacity: float, grey: float) -> Image:
     """A veil of one grey level over an image (H, W, 3): ``opacity`` at the top edge, a third of it at the bottom edge."""
-    share = (opacity * np.linspace(1.0, 1 / 3, len(image), dtype=np.float32))[:, None, None]
-    return (image * (1 - share) + np.float32(grey) * share).astype(np.uint8)
+    share = 256 * opacity * np.linspace(1.0, 1 / 3, len(image))[:, None, None]
+    kept, added = (256 - share).astype(np.uint16), (share * grey).astype(np.uint16)
+    return ((image * kept + added) >> 8).astype(np.uint8)
 
 
 def streaked(image: Image, length_px: float, angle_rad: float) -> Image:
@@ -158,13 +173,12 @@ def rescale(
     """
     scale = float(np.exp(rng.uniform(*np.log(config.scale))))
     canvas, middle = np.array(size, dtype=np.float64), np.array(image.shape[1::-1]) / 2
-    return _moved(
-        image, xyxy_px, size, scale, canvas / 2 + rng.uniform(-config.shift, config.shift, 2) * canvas - scale * middle
-    )
+    shift = rng.uniform(-config.shift, config.shift, 2) * canvas
+    return _moved(image, xyxy_px, size, scale, canvas / 2 + shift - scale * middle)
 
 
 def place(image: Image, xyxy_px: Array, size: tuple[int, int], rng: np.random.Generator) -> tuple[Image, Array]:
-    """An image and its boxes on a canvas of ``size`` (width, height), not scaled: in the upper left corner, or a random part."""
+    """An image and its boxes on a canvas of ``size`` (width, height), not scaled: in its corner, or a random part."""
     if image.shape[1::-1] == size:
         return image, xyxy_px
     spare = np.maximum(np.array(image.shape[1::-1]) - size, 0)

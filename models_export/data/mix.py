@@ -14,7 +14,7 @@ from service.geometry.transforms import Array
 
 @dataclass(frozen=True)
 class MixConfig:
-    """Shares of the draws by the first part of a sample's source; those of data sets that are present are scaled to sum to 1."""
+    """Shares of the draws by the first part of a sample's source; those of the data sets present are scaled to sum to 1."""
 
     shares: tuple[tuple[str, float], ...] = (
         ("simulated", 0.5),

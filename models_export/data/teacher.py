@@ -44,6 +44,8 @@ class AgreeConfig:
     """Of the views that had it whole, at least."""
     min_score: float = 0.4
     """Mean score over the views that found it, at least."""
+    noise_score: float = 0.35
+    """A candidate below that only one view found is nothing: zebra crossings, shadows."""
     known_overlap: float = 0.4
     """A candidate of which more lies in one box that is labelled already adds nothing."""
 
@@ -146,7 +148,8 @@ def agreed(seen: Candidates, labelled: Labels, config: AgreeConfig) -> Labels:
     rows = []
     for row in range(len(seen.score)):
         box = seen.xyxy[row]
-        if _share_inside(box, taken) > config.known_overlap:
+        noise = seen.found[row] == 1 and seen.score[row] < config.noise_score
+        if noise or _share_inside(box, taken) > config.known_overlap:
             continue
         sure = seen.found[row] >= config.min_views and seen.found[row] >= config.min_share * seen.possible[row]
         sure = sure and seen.score[row] >= config.min_score

@@ -17,6 +17,8 @@ from service.errors import InputError, NotFoundError
 ARCHIVE = "traffic_videos.zip"
 SOURCE = "traffic_videos"
 ATTRIBUTION = "Clips of traffic cameras from repositories under MIT"
+LEFT_OUT = frozenset({"bgs_video.avi"})
+"""Outlines of the vehicles are painted into its frames."""
 EVERY = 10
 """Every tenth frame: a car has moved on by then."""
 _QUALITY = 95
@@ -30,7 +32,7 @@ def read_frames(archive: Path, every: int = EVERY) -> Iterator[tuple[str, bytes]
     if not archive.is_file():
         raise NotFoundError("no such archive.", field=str(archive), remedy="Give the folder that holds it.")
     with zipfile.ZipFile(archive) as stored, tempfile.TemporaryDirectory() as folder:
-        for member in sorted(name for name in stored.namelist() if not name.endswith("/")):
+        for member in sorted(name for name in stored.namelist() if not name.endswith("/") and Path(name).name not in LEFT_OUT):
             yield from _frames_of(Path(stored.extract(member, folder)), every)
 
 

@@ -48,7 +48,7 @@ def tall(sample: Sample) -> DetectionSample:
     return DetectionSample(
         np.concatenate([sample.canvas, sample.canvas]),
         (sample.image_size[0], 2 * sample.image_size[1]),
-        np.concatenate([sample.xyxy_px, sample.xyxy_px + [0, 96, 0, 96]]),
+        np.concatenate([sample.xyxy_px, sample.xyxy_px + np.array([0, 96, 0, 96])]),
         np.tile(sample.ignore, 2),
         np.tile(sample.cls, 2),
         np.zeros(2 * len(sample.cls), dtype=bool),
