@@ -15,9 +15,11 @@ from models_export.nets.blocks import start_with_rare_objects
 from service.nets.detector import BOX_FIELDS
 
 _LEAK = 0.1
-_STAGES = ((64, 1), (128, 2), (256, 8), (512, 8), (1024, 4))
-"""Channels and residual blocks of Darknet-53's stages, at strides 2 to 32."""
-BACKBONE_CONVOLUTIONS = 1 + sum(1 + 2 * blocks for _, blocks in _STAGES)
+_STAGE_FILTERS = (64, 128, 256, 512, 1024)
+"""Channels of Darknet-53's stages, at strides 2 to 32."""
+RESIDUALS = (1, 2, 8, 8, 4)
+"""Residual blocks of Darknet-53's stages."""
+BACKBONE_CONVOLUTIONS = 1 + sum(1 + 2 * blocks for blocks in RESIDUALS)
 """Convolutions of Darknet-53 without its classifier: what ``darknet53.conv.74`` holds."""
 
 
@@ -67,36 +69,37 @@ class Upsample:
 Layer = Conv | Predict | Output | Shortcut | MaxPool | Route | Upsample
 
 
-def _scale(filters: int) -> list[Layer]:
+def yolov3_layers(residuals: tuple[int, ...] = RESIDUALS) -> tuple[Layer, ...]:
+    """YOLOv3's layers: Darknet-53, then three outputs, each beside a finer stage of the backbone than the one before."""
+    layers: list[Layer] = [Conv(32, 3)]
+    ends = []
+    for filters, blocks in zip(_STAGE_FILTERS, residuals, strict=True):
+        layers += [Conv(filters, 3, 2), *[Conv(filters // 2, 1), Conv(filters, 3), Shortcut()] * blocks]
+        ends.append(len(layers) - 1)
+    layers += _output_after(512)
+    layers += [*_back_beside(256, ends[3]), *_output_after(256)]
+    layers += [*_back_beside(128, ends[2]), *_output_after(128)]
+    return tuple(layers)
+
+
+def yolov3_tiny_layers() -> tuple[Layer, ...]:
+    """YOLOv3-tiny's layers: convolutions with poolings between them, then two outputs."""
+    layers: list[Layer] = [Conv(16, 3)]
+    for filters in (32, 64, 128, 256):
+        layers += [MaxPool(2), Conv(filters, 3)]
+    fine = len(layers) - 1
+    layers += [MaxPool(2), Conv(512, 3), MaxPool(1), Conv(1024, 3), Conv(256, 1), Conv(512, 3), Predict(), Output()]
+    return (*layers, *_back_beside(128, fine), Conv(256, 3), Predict(), Output())
+
+
+def _output_after(filters: int) -> list[Layer]:
     """The convolutions before and at one of YOLOv3's outputs."""
     return [*[Conv(filters, 1), Conv(2 * filters, 3)] * 3, Predict(), Output()]
 
 
-def _back_to(filters: int, layer: int) -> list[Layer]:
-    """From an output back to its trunk, twice as fine, beside a finer layer of the backbone."""
+def _back_beside(filters: int, layer: int) -> list[Layer]:
+    """From an output back to its trunk, twice as fine, beside a layer of the backbone."""
     return [Route((-4,)), Conv(filters, 1), Upsample(), Route((-1, layer))]
-
-
-def _darknet53() -> list[Layer]:
-    layers: list[Layer] = [Conv(32, 3)]
-    for filters, blocks in _STAGES:
-        layers += [Conv(filters, 3, 2), *[Conv(filters // 2, 1), Conv(filters, 3), Shortcut()] * blocks]
-    return layers
-
-
-def _pooled(*filters: int) -> list[Layer]:
-    """Convolutions with a pooling that halves the picture between them."""
-    layers: list[Layer] = [Conv(filters[0], 3)]
-    for count in filters[1:]:
-        layers += [MaxPool(2), Conv(count, 3)]
-    return layers
-
-
-YOLOV3: tuple[Layer, ...] = (*_darknet53(), *_scale(512), *_back_to(256, 61), *_scale(256), *_back_to(128, 36), *_scale(128))
-_TINY_TOP: tuple[Layer, ...] = (MaxPool(1), Conv(1024, 3), Conv(256, 1), Conv(512, 3), Predict(), Output())
-YOLOV3_TINY: tuple[Layer, ...] = (
-    *_pooled(16, 32, 64, 128, 256, 512), *_TINY_TOP, *_back_to(128, 8), Conv(256, 3), Predict(), Output(),
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,7 @@ class Yolov3Config:
 
     classes: tuple[str, ...] = ("car",)
     strides: tuple[int, ...] = (8, 16, 32)
-    """Finest first; two of them (16, 32) are YOLOv3-tiny."""
+    """Finest first."""
     anchors_px: tuple[tuple[tuple[float, float], ...], ...] = (
         ((10.0, 13.0), (16.0, 30.0), (33.0, 23.0)),
         ((30.0, 61.0), (62.0, 45.0), (59.0, 119.0)),
@@ -116,11 +119,13 @@ class Yolov3Config:
     """Widest image that the detector is given, px."""
     width: float = 1.0
     """Factor on the channels of every layer but the outputs. The published networks have 1."""
+    residuals: tuple[int, ...] = RESIDUALS
+    """Residual blocks of the backbone's stages; YOLOv3-tiny has none."""
 
     @property
     def layers(self) -> tuple[Layer, ...]:
         """Darknet's layers."""
-        return YOLOV3_TINY if self.strides == (16, 32) else YOLOV3
+        return yolov3_layers(self.residuals) if self.residuals else yolov3_tiny_layers()
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -134,7 +139,7 @@ def tiny_config(classes: tuple[str, ...] = ("car",), max_width: int = 416) -> Yo
     Those are the second to fourth for the finer scale, although Darknet's own cfg names the first to third.
     """
     anchors = (((23.0, 27.0), (37.0, 58.0), (81.0, 82.0)), ((81.0, 82.0), (135.0, 169.0), (344.0, 319.0)))
-    return Yolov3Config(classes=classes, strides=(16, 32), anchors_px=anchors, max_width=max_width)
+    return Yolov3Config(classes=classes, strides=(16, 32), anchors_px=anchors, max_width=max_width, residuals=())
 
 
 class ConvBlock(nn.Sequential):

@@ -91,9 +91,11 @@ def test_a_file_of_another_length_is_refused_with_sizes(tmp_path: Path) -> None:
     data = (tmp_path / "whole").read_bytes()
     for name, wrong in (("cut", data[:-400]), ("long", data + bytes(400))):
         (tmp_path / name).write_bytes(wrong)
-        with pytest.raises(InputError, match=rf"{len(wrong) - 20:,} bytes after the header, the network has {len(data) - 20:,}\."):
+        with pytest.raises(
+            InputError, match=rf"{len(wrong) - 20:,} bytes after the header, the network has {len(data) - 20:,}\."
+        ):
             read_weights(net, tmp_path / name)
-        with pytest.raises(InputError, match="of them after convolution 1[23] of 13"):
+        with pytest.raises(InputError, match=r"of them after convolution 1[23] of 13"):
             read_backbone(net, tmp_path / name)
 
 

@@ -11,8 +11,6 @@ import torch
 from models_export.export import to_onnx, with_metadata
 from models_export.nets.blocks import parameter_count
 from models_export.nets.yolov3 import (
-    YOLOV3,
-    YOLOV3_TINY,
     ConvBlock,
     Layer,
     MaxPool,
@@ -22,12 +20,15 @@ from models_export.nets.yolov3 import (
     Yolov3,
     Yolov3Config,
     tiny_config,
+    yolov3_layers,
+    yolov3_tiny_layers,
 )
 from models_export.verify import require_parity
 from service.nets.pack import open_network
 
 COCO = tuple(f"class {number}" for number in range(80))
-SMALL = Yolov3Config(width=0.125)
+YOLOV3, YOLOV3_TINY = yolov3_layers(), yolov3_tiny_layers()
+SMALL = Yolov3Config(width=0.125, residuals=(1, 1, 1, 1, 1))
 SMALL_TINY = replace(tiny_config(), width=0.25)
 
 
@@ -96,11 +97,10 @@ def test_a_convolution_is_normalised_and_leaks() -> None:
     np.testing.assert_allclose(out.detach().numpy().ravel(), [-0.5 * 0.1, 3.5], rtol=1e-4)
 
 
-@pytest.mark.parametrize("config", [SMALL, SMALL_TINY])
-def test_onnx_runtime_computes_the_same_at_any_size(config: Yolov3Config) -> None:
+def test_onnx_runtime_computes_the_same_at_any_size() -> None:
     torch.manual_seed(0)
-    net = Yolov3(config).eval()
-    model = to_onnx(net, "detector", (96, 160), config.outputs, dynamic_hw=True)
+    net = Yolov3(SMALL).eval()
+    model = to_onnx(net, "detector", (96, 160), SMALL.outputs, dynamic_hw=True)
     rng = np.random.default_rng(1)
     images = [rng.integers(0, 255, shape, dtype=np.uint8) for shape in ((1, 96, 160, 3), (3, 64, 192, 3))]
     require_parity(net, open_network("detector", with_metadata(model, {"format": "yolov3"})), images)
