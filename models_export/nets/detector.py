@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from models_export.nets.blocks import Normalise, conv, stage
-from service.nets.detector import BOX_FIELDS
+from service.nets.decoding import BOX_FIELDS
 
 # Vehicles cover a few cells of a few thousand: start the objectness low, or the first steps only unlearn it.
 _PRIOR_OBJECTNESS_LOGIT = -4.6
