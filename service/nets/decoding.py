@@ -108,7 +108,7 @@ def _nanodet(heads: Outputs, spec: DetectorSpec, threshold: float) -> _Candidate
         scores = np.concatenate(heads[: len(spec.strides)])
         distances = np.concatenate(heads[len(spec.strides) :])
     rows = _rows_above(scores, spec, _logit(threshold) if spec.is_logit else threshold)
-    bins = distances[rows].astype(np.float64).reshape(len(rows), 4, -1)
+    bins = distances[rows].astype(np.float64).reshape(len(rows), 4, distances.shape[1] // 4)
     weights = np.exp(bins - bins.max(2, keepdims=True))
     cell, stride = _flat_cells(spec)
     ltrb = (weights @ np.arange(bins.shape[2])) / weights.sum(2) * stride[rows]
