@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor, nn
 
 from models_export.nets.blocks import Normalise, conv, stage, start_with_rare_objects
-from service.nets.detector import BOX_FIELDS
+from service.nets.decoding import BOX_FIELDS
 
 
 @dataclass(frozen=True)

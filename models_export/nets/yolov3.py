@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from models_export.nets.blocks import start_with_rare_objects
-from service.nets.detector import BOX_FIELDS
+from service.nets.decoding import BOX_FIELDS
 
 _LEAK = 0.1
 _STAGE_FILTERS = (64, 128, 256, 512, 1024)
