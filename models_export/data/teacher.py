@@ -8,7 +8,7 @@ pupil is not blamed for. Candidates are kept on disk, so that thresholds can be 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -20,7 +20,7 @@ from models_export.data.detection import ANY_VEHICLE, IGNORED, Labels
 from service.errors import InputError
 from service.geometry.iou import iou_2d
 from service.geometry.transforms import Array
-from service.nets.detector import Detections
+from service.nets.detections import Detections
 
 Image = NDArray[np.uint8]
 
@@ -39,13 +39,15 @@ class AgreeConfig:
     """When candidates become labels."""
 
     min_views: int = 3
-    """Views that found it, at least."""
+    """Views that found it, at least; all of them where fewer had it whole."""
     min_share: float = 0.5
     """Of the views that had it whole, at least."""
     min_score: float = 0.4
     """Mean score over the views that found it, at least."""
     noise_score: float = 0.35
     """A candidate below that only one view found is nothing: zebra crossings, shadows."""
+    max_doubt_area: float = 0.06
+    """A doubtful candidate that takes a larger part of the picture is nothing: groups of vehicles, patches of road."""
     known_overlap: float = 0.4
     """A candidate of which more lies in one box that is labelled already adds nothing."""
 
@@ -78,8 +80,8 @@ class Candidates:
 class Teacher(Protocol):
     """A detector of vehicles."""
 
-    def detect(self, image: Image, *, score_threshold: float) -> Detections:
-        """Boxes in the image's pixels."""
+    def detect(self, images: Sequence[Image], *, score_threshold: float) -> list[Detections]:
+        """Boxes in the images' pixels."""
 
 
 def views() -> list[View]:
@@ -101,7 +103,7 @@ def look(teacher: Teacher, image: Image, view: View) -> tuple[Array, Array]:
     x0, y0, x1, y1 = np.round(np.array([view.x0, view.y0, view.x1, view.y1]) * [width, height, width, height]).astype(int)
     part = image[y0:y1, x0:x1]
     part = np.ascontiguousarray(part[:, ::-1] if view.mirrored else part)
-    found = teacher.detect(part, score_threshold=MIN_SCORE)
+    (found,) = teacher.detect([part], score_threshold=MIN_SCORE)
     xyxy = found.xyxy_px.copy()
     if view.mirrored:
         xyxy[:, [0, 2]] = (part.shape[1] - 1) - found.xyxy_px[:, [2, 0]]
@@ -151,8 +153,10 @@ def agreed(seen: Candidates, labelled: Labels, config: AgreeConfig) -> Labels:
         noise = seen.found[row] == 1 and seen.score[row] < config.noise_score
         if noise or _share_inside(box, taken) > config.known_overlap:
             continue
-        sure = seen.found[row] >= config.min_views and seen.found[row] >= config.min_share * seen.possible[row]
-        sure = sure and seen.score[row] >= config.min_score
+        wanted = max(min(config.min_views, seen.possible[row]), config.min_share * seen.possible[row])
+        sure = seen.found[row] >= wanted and seen.score[row] >= config.min_score
+        if not sure and np.prod(box[2:] - box[:2]) > config.max_doubt_area:
+            continue
         kinds.append(ANY_VEHICLE if sure else IGNORED)
         rows.append(box)
         if sure:
