@@ -43,7 +43,8 @@ from models_export.verify import require_parity
 from service.errors import InputError
 from service.nets.canvas import to_canvas
 from service.nets.depth import DepthNet
-from service.nets.detector import Detections, Detector
+from service.nets.detections import Detections
+from service.nets.detector import Detector
 from service.nets.multibin import UNCERTAIN, Multibin
 from service.nets.pack import Manifest, open_network
 

@@ -21,9 +21,10 @@ from service.geometry.boxes import Boxes, clip_extents, cut_edges
 from service.geometry.camera import Camera, UInt8Image, yaw_from_alpha
 from service.geometry.transforms import Array
 from service.lifting import LiftSettings, Measurements, lift
-from service.nets.canvas import canvas_size
+from service.nets.canvas import Canvases, canvas_size
 from service.nets.depth import DepthNet
-from service.nets.detector import Detections, Detector, edge_sigma
+from service.nets.detections import Detections
+from service.nets.detector import NMS_IOU, SCORE_THRESHOLD, Detector, edge_sigma
 from service.nets.multibin import Crops, Multibin, MultibinEstimates, cut_crops
 from service.nets.pack import Pack
 from service.paper_fusion import PaperFusionSettings, fuse_paper
@@ -39,9 +40,9 @@ class PipelineSettings:
 
     method: Literal["map", "paper"] = "map"
     """How boxes are lifted and fused: by maximum a posteriori and information, or as in the source paper."""
-    score_threshold: float = 0.3
+    score_threshold: float = SCORE_THRESHOLD
     """2D detections of a lower score are dropped."""
-    nms_iou: float = 0.55
+    nms_iou: float = NMS_IOU
     """2D boxes that overlap a better one by more are dropped."""
     min_fused_score: float = 0.3
     """Fused boxes of a lower score are dropped."""
@@ -109,11 +110,12 @@ class Pipeline:
             views, failed = self._decode(frame_set)
         cameras, images = [view.camera for view in views], [view.small for view in views]
         with _timed(timing, "detect"):
-            found = self.detector.detect(images, score_threshold=self.settings.score_threshold, nms_iou=self.settings.nms_iou)
+            canvases = Canvases(images)
+            found = self._detect(canvases)
         with _timed(timing, "orient"):
             estimates = self._orient(views, found)
         with _timed(timing, "depth"):
-            readings = self._read_depth(frame_set, views, found)
+            readings = self._read_depth(frame_set, views, canvases, found)
         with _timed(timing, "lift"):
             measurements = self._measurements(views, found, estimates, readings)
             lifted = self._lift(cameras, frame_set.site, measurements)
@@ -169,6 +171,10 @@ class Pipeline:
             raise next(iter(failed.values()))
         return views, failed
 
+    def _detect(self, canvases: Canvases) -> list[Detections]:
+        batches, settings = canvases.batches(self.detector.fit), self.settings
+        return self.detector.detect_on(batches, score_threshold=settings.score_threshold, nms_iou=settings.nms_iou)
+
     def _orient(self, views: list[_View], found: list[Detections]) -> MultibinEstimates:
         size = self.multibin.spec.crop_px
         crops = [
@@ -177,9 +183,11 @@ class Pipeline:
         ]
         return self.multibin.estimate(Crops.concatenate(crops), np.concatenate([detections.cls for detections in found]))
 
-    def _read_depth(self, frame_set: FrameSet, views: list[_View], found: list[Detections]) -> DepthReadings:
+    def _read_depth(
+        self, frame_set: FrameSet, views: list[_View], canvases: Canvases, found: list[Detections]
+    ) -> DepthReadings:
         parts = []
-        maps = self.depth.infer([view.small for view in views])
+        maps = self.depth.infer_on(canvases.batches(self.depth.fit))
         for view, inverse, detections in zip(views, maps, found, strict=True):
             scale = self._scales.update(view.own, view.small_camera, frame_set.site.ground, inverse)
             parts.append(read_boxes(inverse, scale, detections.xyxy_px, self.depth.reading))

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models_export.data.dataset import UNKNOWN_CONDITION, Scene, open_scene
-from models_export.data.samples import Labels, Sample, label_vehicles
+from models_export.data.detection import VehicleSample
+from models_export.data.samples import SeenVehicles, seen_vehicles
 from service.frames import decode
 from service.geometry.boxes import clip_extents
 from service.geometry.camera import Camera, ray_azimuth
@@ -86,22 +87,24 @@ def _vehicles_of(
 ) -> Iterator[Vehicle]:
     image = decode(scene.frame_bytes(camera.id, step), camera, max_width)
     scaled = camera.scaled(image.shape[1], image.shape[0])
-    labels = label_vehicles(scene.truth(step), index, scaled, classes, _MIN_SIDE_PX)
+    labels = seen_vehicles(scene.truth(step), index, scaled, classes, _MIN_SIDE_PX)
     yield from cut_vehicles(image, scaled, labels, scene.condition)
 
 
-def vehicles_of(sample: Sample) -> list[Vehicle]:
+def vehicles_of(sample: VehicleSample) -> list[Vehicle]:
     """The vehicles of a sample, out of its canvas: no larger than the detector sees them."""
     width, height = sample.image_size
-    return list(cut_vehicles(sample.canvas[:height, :width], sample.camera, sample, sample.weather))
+    return list(
+        cut_vehicles(sample.canvas[:height, :width], sample.camera, sample, sample.labels.get("weather", UNKNOWN_CONDITION))
+    )
 
 
 def cut_vehicles(
-    image: NDArray[np.uint8], camera: Camera, labels: Labels | Sample, weather: str = UNKNOWN_CONDITION
+    image: NDArray[np.uint8], camera: Camera, labels: SeenVehicles | VehicleSample, weather: str = UNKNOWN_CONDITION
 ) -> Iterator[Vehicle]:
     """The labelled vehicles of an image (H, W, 3) whose size is the camera's; ignored ones are left out."""
     height, width = image.shape[:2]
-    for row in np.flatnonzero(~labels.ignore):
+    for row in np.flatnonzero(~labels.ignore & labels.class_known):
         xyxy = clip_extents(camera, labels.xyxy_px[row])
         half = 0.5 * _ROOM * CONTEXT * float((xyxy[2:] - xyxy[:2]).max())
         center = (xyxy[:2] + xyxy[2:]) / 2

@@ -63,9 +63,13 @@ class Network:
     metadata: dict[str, Any]
 
     def run(self, batch: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
-        """All outputs, in the graph's order, for one input batch."""
-        outputs: list[NDArray[np.float32]] = self.session.run(None, {self.session.get_inputs()[0].name: batch})
-        return outputs
+        """All outputs, in the graph's order, for one input batch (B, ...); a graph for one at a time runs B times."""
+        graph_input = self.session.get_inputs()[0]
+        if graph_input.shape[0] != 1 or len(batch) == 1:
+            outputs: list[NDArray[np.float32]] = self.session.run(None, {graph_input.name: batch})
+            return outputs
+        single = [self.session.run(None, {graph_input.name: batch[row : row + 1]}) for row in range(len(batch))]
+        return [np.concatenate(rows) for rows in zip(*single, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)

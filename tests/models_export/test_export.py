@@ -22,7 +22,7 @@ from service.nets.pack import load_pack, open_network
 
 DETECTOR = DetectorConfig(channels=(8, 8, 16, 24, 32), residuals=(0, 1, 1, 0))
 METADATA = {
-    "classes": ["car"],
+    "classes": list(DETECTOR.classes),
     "strides": list(DETECTOR.strides),
     "anchors_px": DETECTOR.anchors_px,
     "max_width": 672,
@@ -99,7 +99,7 @@ def test_a_written_pack_loads_and_runs(detector: tuple[EdgeDetector, bytes], tmp
     head = with_metadata(detector[1], METADATA)
     networks = [Exported(name, head, "fp32", 7) for name in ("detector", "multibin", "depth")]
     manifest = write_pack(
-        tmp_path, networks, name="toy", version="0", classes=["car"], training={"seed": 1}, scores={"none": 0}
+        tmp_path, networks, name="toy", version="0", classes=DETECTOR.classes, training={"seed": 1}, scores={"none": 0}
     )
     pack = load_pack(str(tmp_path))
     assert pack.manifest == manifest

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models_export.data.samples import Labels
+from models_export.data.samples import SeenVehicles
 from models_export.data.vehicles import Vehicle, cut_vehicles
 from models_export.train.multibin import MAX_JITTER, jittered
 from service.geometry.camera import Camera, ray_azimuth
@@ -24,7 +24,9 @@ def white_box(xyxy: list[int]) -> Vehicle:
     image[y0 : y1 + 1, x0 : x1 + 1] = 255
     edges = np.array([[x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5]])
     zero = np.zeros(1, np.int64)
-    labels = Labels(edges, zero > 0, zero, np.array([[4.0, 1.8, 1.5]]), np.array([0.4]), np.ones(1), np.zeros(1))
+    labels = SeenVehicles(
+        edges, zero > 0, zero, zero == 0, np.array([[4.0, 1.8, 1.5]]), np.array([0.4]), np.ones(1), np.zeros(1)
+    )
     (vehicle,) = cut_vehicles(image, CAMERA, labels)
     return vehicle
 
