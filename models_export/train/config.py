@@ -72,6 +72,8 @@ class TrainConfig:
     """Steps between validations; the last step always validates."""
     validation_items: int = 32
     """Items of each camera and of each weather that validate, at most."""
+    init: str | None = None
+    """Name of the file or folder whose weights training starts from, for the record."""
 
     def __post_init__(self) -> None:
         if (self.steps is None) == (self.epochs is None):

@@ -63,7 +63,21 @@ class Network:
     metadata: dict[str, Any]
 
     def run(self, batch: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
-        """All outputs, in the graph's order, for one input batch."""
+        """All outputs, in the graph's order, for one input batch.
+
+        A network that was exported for batches of one size gets the batch in parts of it, the last filled up with zeros.
+        """
+        size = self.session.get_inputs()[0].shape[0]
+        if not isinstance(size, int) or len(batch) == size:
+            return self._run(batch)
+        parts = []
+        for start in range(0, len(batch), size):
+            part = np.zeros((size, *batch.shape[1:]), batch.dtype)
+            part[: len(batch) - start] = batch[start : start + size]
+            parts.append(self._run(part))
+        return [np.concatenate(outputs)[: len(batch)] for outputs in zip(*parts, strict=True)]
+
+    def _run(self, batch: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
         outputs: list[NDArray[np.float32]] = self.session.run(None, {self.session.get_inputs()[0].name: batch})
         return outputs
 
