@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,21 @@ class DetectionSample:
 
 
 @dataclass(frozen=True, eq=False)
+class Still:
+    """A frame as it came from its camera."""
+
+    data: bytes
+    """A JPEG."""
+    camera: Camera
+    """The camera at the frame's own size."""
+
+    def at(self, max_width: int) -> tuple[NDArray[np.uint8], Camera]:
+        """The image (H, W, 3) RGB, at most ``max_width`` px wide, and the camera at its size."""
+        image = decode(self.data, self.camera, max_width)
+        return image, self.camera.scaled(image.shape[1], image.shape[0])
+
+
+@dataclass(frozen=True, eq=False)
 class VehicleSample(DetectionSample):
     """One picture of a calibrated camera, whose vehicles' sizes and headings are known."""
 
@@ -59,6 +74,8 @@ class VehicleSample(DetectionSample):
     """(N, 3) metres."""
     alpha: Array
     """(N,) heading relative to the ray through the 2D box's centre, radians."""
+    still: Still | None = field(default=None, kw_only=True)
+    """The frame, for those who want it larger than the detector does; None: there is no more than the canvas."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from models_export.data.dataset import UNKNOWN_CONDITION, Scene, SceneTruth, list_scenes, open_scene
-from models_export.data.detection import MIN_SIDE_PX, VEHICLES, VehicleSample, class_columns
+from models_export.data.dataset import UNKNOWN_CONDITION, Scene, list_scenes, open_scene
+from models_export.data.detection import MIN_SIDE_PX, VEHICLES, Still, VehicleSample, class_columns
 from service.errors import InputError
-from service.frames import decode
 from service.geometry.boxes import clip_extents, project_extents
 from service.geometry.camera import Camera, ray_azimuth
 from service.geometry.ground import Ground
@@ -33,21 +32,6 @@ VALIDATION_EVERY = 10
 
 
 @dataclass(frozen=True, eq=False)
-class Still:
-    """A frame as it came from its camera."""
-
-    data: bytes
-    """A JPEG."""
-    camera: Camera
-    """The camera at the frame's own size."""
-
-    def at(self, max_width: int) -> tuple[NDArray[np.uint8], Camera]:
-        """The image (H, W, 3) RGB, at most ``max_width`` px wide, and the camera at its size."""
-        image = decode(self.data, self.camera, max_width)
-        return image, self.camera.scaled(image.shape[1], image.shape[0])
-
-
-@dataclass(frozen=True, eq=False)
 class Sample(VehicleSample):
     """One camera's frame of a scene, where everything is known."""
 
@@ -61,8 +45,6 @@ class Sample(VehicleSample):
     """(h, w) 1 / metres at the depth net's stride; 0 where the depth is unknown."""
     weather: str = UNKNOWN_CONDITION
     """Light and weather of the scene: day, night, fog, ..."""
-    still: Still | None = None
-    """The frame, for those who want it larger than the detector does; None for made-up samples."""
 
     @property
     def labels(self) -> dict[str, str]:
@@ -100,55 +82,32 @@ def _load_sample(
 ) -> Sample:
     still = Still(scene.frame_bytes(camera.id, step), camera)
     image, scaled = still.at(max_width)
-    labels = seen_vehicles(scene.truth(step), camera_index, scaled, classes)
+    truth = scene.truth(step)
+    extents, in_front = project_extents(scaled, truth.center, truth.dims_lwh, truth.yaw)
+    kinds = np.array(truth.kinds, dtype=str)
+    seen = in_front & (truth.visible[:, camera_index] > 0) & (np.isin(kinds, classes) | np.isin(kinds, VEHICLES))
+    xyxy = clip_extents(scaled, extents[seen])
+    visible, truncated = truth.visible[seen, camera_index], truth.truncated[seen, camera_index]
+    sides = xyxy[:, 2:] - xyxy[:, :2]
+    cls, known, unwanted = class_columns(kinds[seen].tolist(), classes)
+    ignore = unwanted | (visible < MIN_VISIBLE) | (sides.min(1, initial=np.inf) < MIN_SIDE_PX) | (truncated > MAX_TRUNCATED)
     return Sample(
         canvas=to_canvas(image),
         image_size=(image.shape[1], image.shape[0]),
         camera=scaled,
-        ground=scene.site.ground,
-        inverse_depth=_inverse_depth(scene.depth(camera.id, step), to_canvas(image).shape[:2], image.shape[:2], depth_stride),
-        weather=scene.condition,
-        source=f"{SIMULATED}/{scene.world}",
-        still=still,
-        **vars(labels),
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class SeenVehicles:
-    """The vehicles that one camera shows; fields as in :class:`Sample`."""
-
-    xyxy_px: Array
-    ignore: NDArray[np.bool_]
-    cls: NDArray[np.int64]
-    class_known: NDArray[np.bool_]
-    dims_lwh: Array
-    alpha: Array
-    visible: Array
-    truncated: Array
-
-
-def seen_vehicles(
-    truth: SceneTruth, camera_index: int, camera: Camera, classes: tuple[str, ...], min_side_px: float = MIN_SIDE_PX
-) -> SeenVehicles:
-    """What is asked of a detector in one image: ``camera`` at the image's size, column ``camera_index`` of the truth."""
-    extents, in_front = project_extents(camera, truth.center, truth.dims_lwh, truth.yaw)
-    kinds = np.array(truth.kinds, dtype=str)
-    seen = in_front & (truth.visible[:, camera_index] > 0) & (np.isin(kinds, classes) | np.isin(kinds, VEHICLES))
-    xyxy = clip_extents(camera, extents[seen])
-    visible, truncated = truth.visible[seen, camera_index], truth.truncated[seen, camera_index]
-    sides = xyxy[:, 2:] - xyxy[:, :2]
-    cls, known, unwanted = class_columns(kinds[seen].tolist(), classes)
-    ignore = unwanted | (visible < MIN_VISIBLE) | (sides.min(1, initial=np.inf) < min_side_px) | (truncated > MAX_TRUNCATED)
-    return SeenVehicles(
         xyxy_px=xyxy,
         ignore=ignore,
         cls=cls,
         class_known=known,
+        source=f"{SIMULATED}/{scene.world}",
         dims_lwh=truth.dims_lwh[seen],
-        alpha=wrap_angle(truth.yaw[seen] - ray_azimuth(camera, (xyxy[:, :2] + xyxy[:, 2:]) / 2)),
+        alpha=wrap_angle(truth.yaw[seen] - ray_azimuth(scaled, (xyxy[:, :2] + xyxy[:, 2:]) / 2)),
         visible=visible,
         truncated=truncated,
+        ground=scene.site.ground,
+        inverse_depth=_inverse_depth(scene.depth(camera.id, step), to_canvas(image).shape[:2], image.shape[:2], depth_stride),
+        weather=scene.condition,
+        still=still,
     )
 
 

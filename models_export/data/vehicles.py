@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from models_export.data.dataset import UNKNOWN_CONDITION, Scene, open_scene
+from models_export.data.dataset import UNKNOWN_CONDITION
 from models_export.data.detection import VehicleSample
-from models_export.data.samples import SeenVehicles, seen_vehicles
-from service.frames import decode
 from service.geometry.boxes import clip_extents
 from service.geometry.camera import Camera, ray_azimuth
 from service.geometry.transforms import Array, wrap_angle
@@ -21,8 +17,6 @@ from service.nets.multibin import CONTEXT, crop_vehicles, crop_windows
 
 _ROOM = 1.5
 """Side of the kept picture over that of an exact crop: what jitter of the box may reach."""
-_MIN_SIDE_PX = 8.0
-"""Vehicles whose 2D box is smaller in the image of the crops are left out."""
 _MAX_PATCH_PX = 176
 """Longer sides are reduced: crops are smaller still."""
 
@@ -71,57 +65,42 @@ class Vehicle:
         return crop, alpha, edges
 
 
-def load_vehicles(scenes: Iterable[Path], classes: tuple[str, ...], max_width: int) -> list[Vehicle]:
-    """All vehicles of scenes that a detector is asked for, out of images of at most ``max_width`` px."""
-    found: list[Vehicle] = []
-    for path in scenes:
-        scene = open_scene(path)
-        for step in range(scene.steps):
-            for index, camera in enumerate(scene.site.cameras):
-                found.extend(_vehicles_of(scene, step, index, camera, classes, max_width))
-    return found
+def vehicles_of(sample: VehicleSample, max_width: int | None = None) -> list[Vehicle]:
+    """The vehicles of a sample that a detector is asked for and whose class is known.
 
-
-def _vehicles_of(
-    scene: Scene, step: int, index: int, camera: Camera, classes: tuple[str, ...], max_width: int
-) -> Iterator[Vehicle]:
-    image = decode(scene.frame_bytes(camera.id, step), camera, max_width)
-    scaled = camera.scaled(image.shape[1], image.shape[0])
-    labels = seen_vehicles(scene.truth(step), index, scaled, classes, _MIN_SIDE_PX)
-    yield from cut_vehicles(image, scaled, labels, scene.condition)
-
-
-def vehicles_of(sample: VehicleSample) -> list[Vehicle]:
-    """The vehicles of a sample, out of its canvas: no larger than the detector sees them."""
+    max_width: width to which the sample's frame is decoded for them, px; None, or a sample without a frame: out of its canvas,
+    no larger than the detector sees them.
+    """
     width, height = sample.image_size
-    return list(
-        cut_vehicles(sample.canvas[:height, :width], sample.camera, sample, sample.labels.get("weather", UNKNOWN_CONDITION))
+    image, camera = sample.canvas[:height, :width], sample.camera
+    if max_width is not None and sample.still is not None:
+        image, camera = sample.still.at(max_width)
+    factor = np.tile([image.shape[1] / width, image.shape[0] / height], 2)
+    # Pixel centres lie at integers.
+    boxes = clip_extents(camera, (sample.xyxy_px + 0.5) * factor - 0.5)
+    weather = sample.labels.get("weather", UNKNOWN_CONDITION)
+    rows = np.flatnonzero(~sample.ignore & sample.class_known)
+    return [_cut(image, camera, boxes[row], sample, row, weather) for row in rows]
+
+
+def _cut(image: NDArray[np.uint8], camera: Camera, xyxy_px: Array, sample: VehicleSample, row: int, weather: str) -> Vehicle:
+    """The vehicle in a row of a sample, whose box (4,) is ``xyxy_px`` in an image of the camera's size."""
+    half = 0.5 * _ROOM * CONTEXT * float((xyxy_px[2:] - xyxy_px[:2]).max())
+    center = (xyxy_px[:2] + xyxy_px[2:]) / 2
+    x0, y0 = np.maximum(np.floor(center - half), 0).astype(int)
+    x1, y1 = np.minimum(np.ceil(center + half), image.shape[1::-1]).astype(int)
+    patch = image[y0:y1, x0:x1]
+    reduction = _MAX_PATCH_PX / max(patch.shape)
+    if reduction < 1:
+        patch = cv2.resize(patch, None, fx=reduction, fy=reduction, interpolation=cv2.INTER_AREA)
+    return Vehicle(
+        patch=np.ascontiguousarray(patch),
+        patch_origin_px=np.array([x0, y0]) - 0.5,
+        patch_scale=np.array([patch.shape[1] / (x1 - x0), patch.shape[0] / (y1 - y0)]),
+        xyxy_px=xyxy_px,
+        alpha=float(sample.alpha[row]),
+        dims_lwh=sample.dims_lwh[row],
+        cls=int(sample.cls[row]),
+        camera=camera,
+        weather=weather,
     )
-
-
-def cut_vehicles(
-    image: NDArray[np.uint8], camera: Camera, labels: SeenVehicles | VehicleSample, weather: str = UNKNOWN_CONDITION
-) -> Iterator[Vehicle]:
-    """The labelled vehicles of an image (H, W, 3) whose size is the camera's; ignored ones are left out."""
-    height, width = image.shape[:2]
-    for row in np.flatnonzero(~labels.ignore & labels.class_known):
-        xyxy = clip_extents(camera, labels.xyxy_px[row])
-        half = 0.5 * _ROOM * CONTEXT * float((xyxy[2:] - xyxy[:2]).max())
-        center = (xyxy[:2] + xyxy[2:]) / 2
-        x0, y0 = np.maximum(np.floor(center - half), 0).astype(int)
-        x1, y1 = np.minimum(np.ceil(center + half), [width, height]).astype(int)
-        patch = image[y0:y1, x0:x1]
-        reduction = _MAX_PATCH_PX / max(patch.shape)
-        if reduction < 1:
-            patch = cv2.resize(patch, None, fx=reduction, fy=reduction, interpolation=cv2.INTER_AREA)
-        yield Vehicle(
-            patch=np.ascontiguousarray(patch),
-            patch_origin_px=np.array([x0, y0]) - 0.5,
-            patch_scale=np.array([patch.shape[1] / (x1 - x0), patch.shape[0] / (y1 - y0)]),
-            xyxy_px=xyxy,
-            alpha=float(labels.alpha[row]),
-            dims_lwh=labels.dims_lwh[row],
-            cls=int(labels.cls[row]),
-            camera=camera,
-            weather=weather,
-        )

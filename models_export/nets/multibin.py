@@ -24,8 +24,9 @@ class MultibinConfig:
 
     classes: tuple[str, ...] = ("car", "van", "truck", "bus")
     crop_px: int = 96
-    max_width: int = 1344
-    """Widest image that crops are cut from, px: twice what the detector sees, for crops cost little and show more."""
+    max_width: int | None = 1344
+    """Widest image that crops are cut from, px: twice what the detector sees, for crops cost little and show more. None: what
+    the detector sees."""
     bin_centers_rad: tuple[float, ...] = (0.0, math.pi)
     """Driving away from the camera, and towards it."""
     bin_overlap_rad: float = 0.1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import asdict, replace
 from typing import Any
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from models_export.data.augment import NO_AUGMENT, AugmentConfig, photometric
-from models_export.data.vehicles import Vehicle
+from models_export.data.detection import VehicleSample
+from models_export.data.vehicles import Vehicle, vehicles_of
 from models_export.losses import likelihood_loss, multibin_loss
 from models_export.nets.multibin import SIGMA_UNITS, EdgeMultibin, MultibinConfig
 from models_export.train.task import Batch, ParameterGroup, decayed_groups, draw_uniform
@@ -27,9 +29,9 @@ class MultibinTask:
 
     name = "multibin"
 
-    def __init__(self, vehicles: list[Vehicle], config: MultibinConfig, augment: AugmentConfig | None = None) -> None:
-        self.vehicles = vehicles
-        self.config = replace(config, mean_dims_lwh=mean_dims(vehicles, len(config.classes)))
+    def __init__(self, samples: Sequence[VehicleSample], config: MultibinConfig, augment: AugmentConfig | None = None) -> None:
+        self.vehicles = _vehicles(samples, config)
+        self.config = replace(config, mean_dims_lwh=mean_dims(self.vehicles, len(config.classes)))
         self.augment = augment or AugmentConfig()
         self.net = EdgeMultibin(self.config)
 
@@ -40,10 +42,10 @@ class MultibinTask:
     def __len__(self) -> int:
         return len(self.vehicles)
 
-    def held_out(self, vehicles: list[Vehicle]) -> MultibinTask:
-        """The same network and configuration over other vehicles, which are not augmented: for validation."""
+    def held_out(self, samples: Sequence[VehicleSample]) -> MultibinTask:
+        """The same network and configuration over other samples, which are not augmented: for validation."""
         other = copy(self)
-        other.vehicles, other.augment = vehicles, NO_AUGMENT
+        other.vehicles, other.augment = _vehicles(samples, self.config), NO_AUGMENT
         return other
 
     def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.int64]:
@@ -88,6 +90,10 @@ class MultibinTask:
         terms = likelihood_loss(errors / units, log_sigma - units.log()).mean(0)
         likelihood = {"angle_nll": terms[0], "size_nll": terms[1:4].mean(), "edge_nll": terms[4:].mean()}
         return {**paper, **likelihood, "total": paper["total"] + torch.stack(list(likelihood.values())).sum()}
+
+
+def _vehicles(samples: Sequence[VehicleSample], config: MultibinConfig) -> list[Vehicle]:
+    return [vehicle for sample in samples for vehicle in vehicles_of(sample, config.max_width)]
 
 
 def angle_error(vectors: Tensor, alpha: Tensor, bin_centers: Tensor) -> Tensor:

@@ -7,14 +7,12 @@ import itertools
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from models_export.data.samples import Sample
-from models_export.data.vehicles import vehicles_of
 from models_export.nets.depth import DepthConfig
 from models_export.nets.detector import DetectorConfig
 from models_export.nets.multibin import MultibinConfig
@@ -34,17 +32,12 @@ SMALL_DEPTH = DepthConfig(stem=(8, 8, 16, 16), width=32, blocks=1, heads=2, deco
 SMALL_HEAD = MultibinConfig(crop_px=32, channels=(8, 8, 16, 16), squeezed=16, dropout=0.1)
 
 
-def items_of(name: str, samples: list[Sample]) -> list[Any]:
-    """What a task learns from: vehicles for the multi-bin head, frames for the others."""
-    return [vehicle for sample in samples for vehicle in vehicles_of(sample)] if name == "multibin" else samples
-
-
 def task_of(name: str, samples: list[Sample]) -> DetectorTask | MultibinTask | DepthTask:
     torch.manual_seed(0)
     if name == "detector":
         return DetectorTask(samples, SMALL_DETECTOR)
     if name == "multibin":
-        return MultibinTask(items_of(name, samples), SMALL_HEAD)
+        return MultibinTask(samples, SMALL_HEAD)
     return DepthTask(samples, SMALL_DEPTH)
 
 
@@ -120,7 +113,7 @@ def with_weather(samples: list[Sample]) -> list[Sample]:
 def test_validation_is_logged_by_camera_and_weather(name: str, toy_samples: list[Sample], tmp_path: Path) -> None:
     task = task_of(name, toy_samples)
     config = replace(SHORT, steps=4, validate_every=2)
-    fit(task, config, tmp_path, task.held_out(items_of(name, with_weather(toy_samples[4:]))))
+    fit(task, config, tmp_path, task.held_out(with_weather(toy_samples[4:])))
     with (tmp_path / f"{name}.validation.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert [(row["step"], row["axis"], row["label"]) for row in rows] == [
@@ -137,7 +130,7 @@ def test_validation_is_logged_by_camera_and_weather(name: str, toy_samples: list
 
 def test_validation_is_the_same_whenever_it_is_asked(toy_samples: list[Sample]) -> None:
     task = task_of("multibin", toy_samples)
-    validation, again = (Validation.of(task.held_out(items_of("multibin", with_weather(toy_samples))), SHORT) for _ in range(2))
+    validation, again = (Validation.of(task.held_out(with_weather(toy_samples)), SHORT) for _ in range(2))
     task.net.train()
     assert validation.losses(task.net, SHORT, 0) == again.losses(task.net, SHORT, 0)
     assert task.net.training

@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models_export.data.samples import SeenVehicles
-from models_export.data.vehicles import Vehicle, cut_vehicles
+from models_export.data.detection import VehicleSample
+from models_export.data.vehicles import Vehicle, vehicles_of
 from models_export.train.multibin import MAX_JITTER, jittered
 from service.geometry.camera import Camera, ray_azimuth
 from service.geometry.transforms import pole_camera_pose, wrap_angle
@@ -22,12 +22,21 @@ def white_box(xyxy: list[int]) -> Vehicle:
     image = np.zeros((240, 400, 3), np.uint8)
     x0, y0, x1, y1 = xyxy
     image[y0 : y1 + 1, x0 : x1 + 1] = 255
-    edges = np.array([[x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5]])
     zero = np.zeros(1, np.int64)
-    labels = SeenVehicles(
-        edges, zero > 0, zero, zero == 0, np.array([[4.0, 1.8, 1.5]]), np.array([0.4]), np.ones(1), np.zeros(1)
+    (vehicle,) = vehicles_of(
+        VehicleSample(
+            canvas=image,
+            image_size=(400, 240),
+            xyxy_px=np.array([[x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5]]),
+            ignore=zero > 0,
+            cls=zero,
+            class_known=zero == 0,
+            source="toy",
+            camera=CAMERA,
+            dims_lwh=np.array([[4.0, 1.8, 1.5]]),
+            alpha=np.array([0.4]),
+        )
     )
-    (vehicle,) = cut_vehicles(image, CAMERA, labels)
     return vehicle
 
 
