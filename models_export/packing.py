@@ -34,7 +34,8 @@ from models_export.validate import (
 from models_export.verify import require_parity
 from service.nets.canvas import to_canvas
 from service.nets.depth import DepthNet
-from service.nets.detector import Detections, Detector
+from service.nets.detections import Detections
+from service.nets.detector import Detector
 from service.nets.multibin import Multibin, crop_vehicles
 from service.nets.pack import Manifest, Network, open_network
 

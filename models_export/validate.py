@@ -21,7 +21,8 @@ from service.geometry.camera import ray_azimuth
 from service.geometry.iou import iou_2d
 from service.geometry.transforms import Array, wrap_angle
 from service.nets.depth import UNBIASED, DepthNet, InverseDepth
-from service.nets.detector import Detections, Detector, box_size
+from service.nets.detections import Detections
+from service.nets.detector import Detector, box_size
 from service.nets.error_model import ErrorModel
 from service.nets.multibin import Multibin, crop_vehicles
 

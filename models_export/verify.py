@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -20,18 +21,30 @@ float16 keeps 11 bits, so that each rounding moves a value by up to 5e-4 of itse
 """
 
 
+@dataclass(frozen=True, eq=False)
+class TorchNetwork:
+    """A torch network with the face of :class:`service.nets.pack.Network`, for what decodes its outputs."""
+
+    name: str
+    net: nn.Module
+    metadata: dict[str, Any]
+
+    def run(self, batch: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
+        """All outputs for one input batch."""
+        with torch.inference_mode():
+            outputs = self.net(torch.from_numpy(batch))
+        return [output.numpy() for output in (outputs if isinstance(outputs, tuple) else (outputs,))]
+
+
 def parity(net: nn.Module, network: Network, inputs: Sequence[NDArray[np.uint8]]) -> float:
     """Largest absolute difference between torch and ONNX Runtime, over each output's range, on real inputs.
 
     inputs: batches (B, H, W, 3) uint8; give several shapes, non-square ones among them.
     """
+    ours = TorchNetwork(network.name, net, network.metadata)
     worst = 0.0
     for batch in inputs:
-        with torch.inference_mode():
-            expected = net(torch.from_numpy(batch))
-        expected = expected if isinstance(expected, tuple) else (expected,)
-        for ours, theirs in zip(expected, network.run(batch), strict=True):
-            reference = ours.numpy()
+        for reference, theirs in zip(ours.run(batch), network.run(batch), strict=True):
             if reference.shape != theirs.shape:
                 raise PackError(f"shape {theirs.shape}, torch gives {reference.shape}.", field=network.name)
             span = float(np.ptp(reference)) or 1.0

@@ -32,6 +32,7 @@ _HELP = {
     "scenes": "Render simulated scenes for training and tests.",
     "train": "Train the networks.",
     "export": "Export trained networks to an ONNX pack.",
+    "import-darknet": "Make a pack around YOLOv3 weights in a Darknet file.",
     "carla": "Capture scenes from a CARLA server.",
 }
 

@@ -19,7 +19,7 @@ from models_export.losses import ciou
 from models_export.nets.detector import DetectorConfig, EdgeDetector
 from models_export.train.task import Batch, ParameterGroup, decayed_groups, draw_uniform
 from service.geometry.transforms import Array
-from service.nets.detector import BOX_FIELDS
+from service.nets.decoding import BOX_FIELDS
 
 MAX_RATIO = 4.0
 """An anchor answers for a box whose sides differ from its own by less than this factor: what (2 sigmoid)^2 can reach."""
@@ -167,7 +167,7 @@ def assign(targets: Tensor, grid_shape: tuple[int, int], stride: int, anchors: T
 
 
 def decode(cells: Tensor, index: tuple[Tensor, ...], stride: int, anchors: Tensor) -> Tensor:
-    """Boxes xyxy (P, 4) in px of cells (P, 5 + C) of logits: as ``service.nets.detector.decode_heads``, with gradients."""
+    """Boxes xyxy (P, 4) in px of cells (P, 5 + C) of logits: as ``service.nets.decoding.decode_heads``, with gradients."""
     probability = cells.sigmoid()
     place = torch.stack([index[3], index[2]], 1)
     center = (2 * probability[:, :2] - 0.5 + place) * stride - 0.5
