@@ -38,6 +38,13 @@ class AugmentConfig:
     """Largest standard deviation of the noise, grey levels."""
 
 
+NO_AUGMENT = AugmentConfig(
+    scale=(1.0, 1.0), shift=0.0, geometric=0.0, flip=0.0, brightness=0.0, contrast=(1.0, 1.0), saturation=(1.0, 1.0),
+    white_balance=0.0, blur=0.0, noise=0.0,
+)  # fmt: skip
+"""Images as they are: for validation."""
+
+
 def photometric(image: Image, rng: np.random.Generator, config: AugmentConfig) -> Image:
     """Another exposure, colour, sharpness and noise; (H, W, 3) RGB in and out."""
     image = np.ascontiguousarray(image)
@@ -48,7 +55,7 @@ def photometric(image: Image, rng: np.random.Generator, config: AugmentConfig) -
     gains = rng.uniform(*config.contrast) * (1 + rng.uniform(-config.white_balance, config.white_balance, 3))
     mean = float(grey.mean())
     levels = (np.arange(256)[:, None] - mean) * gains + mean + rng.uniform(-config.brightness, config.brightness)
-    pixels = cv2.LUT(pixels, np.clip(levels, 0, 255).astype(np.uint8).reshape(1, 256, 3))
+    pixels = cv2.LUT(pixels, np.clip(np.rint(levels), 0, 255).astype(np.uint8).reshape(1, 256, 3))
     if rng.random() < config.blur:
         pixels = cv2.GaussianBlur(pixels, (0, 0), rng.uniform(0.4, 1.0))
     if rng.random() < config.noise:

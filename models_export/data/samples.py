@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from models_export.data.dataset import Scene, list_scenes, open_scene
+from models_export.data.dataset import UNKNOWN_CONDITION, Scene, list_scenes, open_scene
 from service.errors import InputError
 from service.frames import decode
 from service.geometry.boxes import clip_extents, project_extents
@@ -61,6 +61,13 @@ class Sample:
     """The scene's road."""
     inverse_depth: NDArray[np.float32]
     """(h, w) 1 / metres at the depth net's stride; 0 where the depth is unknown."""
+    weather: str = UNKNOWN_CONDITION
+    """Light and weather of the scene: day, night, fog, ..."""
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """What validation tells frames apart by."""
+        return {"camera": self.camera.id, "weather": self.weather}
 
 
 def split_scenes(roots: Iterable[Path]) -> tuple[list[Path], list[Path]]:
@@ -115,6 +122,7 @@ def _load_sample(
         truncated=truncated,
         ground=scene.site.ground,
         inverse_depth=_inverse_depth(scene.depth(camera.id, step), to_canvas(image).shape[:2], image.shape[:2], depth_stride),
+        weather=scene.condition,
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor, nn
 
 PIXEL_SCALE, PIXEL_OFFSET = 1.0 / 127.5, 1.0
@@ -54,9 +53,3 @@ def start_with_rare_objects(bias: Tensor, fields: int) -> None:
 def parameter_count(net: nn.Module) -> int:
     """Number of trained values."""
     return sum(p.numel() for p in net.parameters())
-
-
-def seed_everything(seed: int) -> torch.Generator:
-    """Seed torch and return a generator for data order."""
-    torch.manual_seed(seed)
-    return torch.Generator().manual_seed(seed)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from models_export.data.augment import AugmentConfig, flip_horizontally, photometric, rescale
+from models_export.data.augment import NO_AUGMENT, AugmentConfig, flip_horizontally, photometric, rescale
 from models_export.data.samples import MIN_SIDE_PX, Sample
 from models_export.losses import ciou
 from models_export.nets.detector import DetectorConfig, EdgeDetector
-from models_export.train.loop import Batch
+from models_export.train.task import Batch, ParameterGroup, decayed_groups, draw_uniform
 from service.geometry.transforms import Array
 from service.nets.decoding import BOX_FIELDS
 
@@ -41,10 +43,31 @@ class DetectorTask:
         """Configuration of network, data and augmentation."""
         return {"net": asdict(self.config), "augment": asdict(self.augment), "samples": len(self.samples)}
 
-    def batch(self, rng: np.random.Generator, size: int) -> Batch:
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def held_out(self, samples: list[Sample]) -> DetectorTask:
+        """The same network and configuration over other samples, which are not augmented: for validation."""
+        other = copy(self)
+        other.samples, other.augment = samples, NO_AUGMENT
+        return other
+
+    def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.int64]:
+        """Every frame is as likely as the others."""
+        return draw_uniform(rng, len(self), size)
+
+    def labels(self, index: int) -> dict[str, str]:
+        """Camera and weather of a frame."""
+        return self.samples[index].labels
+
+    def parameter_groups(self, net: nn.Module) -> list[ParameterGroup]:
+        """All of the network at one pace."""
+        return decayed_groups(net)
+
+    def batch(self, indices: NDArray[np.int64], rng: np.random.Generator) -> Batch:
         """Images (B, H, W, 3) uint8; targets (T, 7): image, class, x0, y0, x1, y1 (px), ignore."""
         images, targets = [], []
-        for row, index in enumerate(rng.integers(len(self.samples), size=size)):
+        for row, index in enumerate(indices):
             image, boxes = self._augmented(self.samples[index], rng)
             images.append(image)
             targets.append(np.concatenate([np.full((len(boxes), 1), float(row)), boxes], 1))
