@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor, nn
 
 PIXEL_SCALE, PIXEL_OFFSET = 1.0 / 127.5, 1.0
