@@ -1,73 +1,50 @@
-"""A pack around a detector that was trained elsewhere: its classes mapped to ours, the other networks another pack's."""
+"""A pack around a detector that was made elsewhere: all other networks, and the classes, are another pack's."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from models_export.coco import COCO_CLASSES
 from models_export.export import Exported, write_pack
 from service.errors import InputError
-from service.nets.pack import Manifest, load_pack
+from service.nets.pack import Manifest, Pack, load_pack
 
-UNMEASURED_EDGE_SIGMA = (2.0, 0.03, 1.0, 1.5)
-"""Error model of box edges, px, of a detector that nobody has measured: floor, slope over size, growth, cut."""
-
-
-def network_classes(text: str) -> tuple[str, ...]:
-    """Class names in a network's order, from ``coco``, the path of a file with one name a line, or names with commas."""
-    if text == "coco":
-        return COCO_CLASSES
-    names = Path(text).read_text("utf-8").splitlines() if Path(text).is_file() else text.split(",")
-    found = tuple(name.strip() for name in names if name.strip())
-    if not found or len(set(found)) != len(found):
-        raise InputError(f"'{text}' gives {list(found)}.", field="classes", remedy="Give every class once, in order.")
-    return found
+VERSION = "1"
 
 
-def class_map(network: Sequence[str], ours: Sequence[str], renamed: Mapping[str, str]) -> dict[str, str]:
-    """Names of ours by ids of the network's classes: those of the same name, and ``renamed``; the rest is dropped.
+def open_base(base: str, out: Path) -> Pack:
+    """The pack that gives the other networks: a shipped one's name, or a folder.
 
-    Raises InputError when a name is unknown on either side, or nothing is left.
+    Raises PackError when it cannot be loaded, InputError when the new pack would overwrite it.
     """
-    for theirs, name in renamed.items():
-        if theirs not in network or name not in ours:
-            raise InputError(
-                f"'{theirs}={name}'.",
-                field="map",
-                remedy=f"Left a class of the network, right one of the base pack: {', '.join(ours)}.",
-            )
-    wanted = {**{name: name for name in ours}, **renamed}
-    found = {str(index): wanted[name] for index, name in enumerate(network) if name in wanted}
-    if not found:
-        raise InputError(
-            f"the network has no class of {', '.join(ours)}.", field="classes", remedy="Map some with --map THEIRS=OURS."
-        )
-    return found
+    pack = load_pack(base, provider="cpu")
+    if out.resolve() == pack.path.resolve():
+        raise InputError("it is the base pack's own folder.", field="--out", remedy="Give another folder.")
+    return pack
 
 
 def write_detector_pack(
-    out: Path, base: str, detector: Exported, *, name: str, licence: str, training: Mapping[str, Any], scores: Mapping[str, Any]
+    out: Path, base: Pack, detector: Exported, *, licence: str, origin: Mapping[str, Any], scores: Mapping[str, Any]
 ) -> Manifest:
-    """Write a pack of ``detector`` and all other networks of pack ``base``, with the base's classes.
+    """Write a pack of ``detector`` and the other networks of ``base``, under the name of its folder.
 
-    training, scores: of the detector. licence: of the whole. Raises PackError when the base cannot be loaded.
+    licence, origin, scores: of the detector.
     """
-    loaded = load_pack(base)
-    others = {key: entry for key, entry in loaded.manifest.networks.items() if key != detector.name}
-    copied = [
-        Exported(key, (loaded.path / entry.file).read_bytes(), entry.precision, entry.parameters)
-        for key, entry in others.items()
+    others = [
+        Exported(name, (base.path / entry.file).read_bytes(), entry.precision, entry.parameters)
+        for name, entry in base.manifest.networks.items()
+        if name != detector.name
     ]
-    origin = {"pack": loaded.manifest.name, "version": loaded.manifest.version}
+    known = {name: value for name, value in base.manifest.scores.items() if name != detector.name}
+    from_base = {"name": base.manifest.name, "version": base.manifest.version, "training": base.manifest.training}
     return write_pack(
         out,
-        [detector, *copied],
-        name=name,
-        version="1",
-        licence=licence,
-        classes=loaded.manifest.classes,
-        training={detector.name: dict(training), **dict.fromkeys(others, origin)},
-        scores={detector.name: dict(scores), **{key: loaded.manifest.scores.get(key, {}) for key in others}},
+        [detector, *others],
+        name=out.resolve().name,
+        version=VERSION,
+        classes=base.manifest.classes,
+        training={detector.name: dict(origin), "base": from_base},
+        scores={detector.name: dict(scores), **known},
+        licence=f"detector: {licence}; other networks: {base.manifest.licence}",
     )

@@ -9,17 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
 from benchmarks.drive_score import score_drive
 from benchmarks.drive_torch import score_darknet
 from benchmarks.drive_truth import drive_frames
 from benchmarks.recordings import PANDASET_CLIP, recording
-from models_export.darknet_import import config_of, import_darknet, metadata_of, parse_anchors, parse_renames
+from models_export.darknet_import import app, config_of, import_darknet, yolov3_metadata
 from models_export.darknet_weights import write_weights
 from models_export.data.pandaset import open_pandaset
-from models_export.detector_pack import class_map, network_classes
+from models_export.foreign.names import COCO_CLASSES
 from models_export.nets.yolov3 import Yolov3, Yolov3Config, tiny_config
-from service.errors import InputError, NotFoundError
+from service.errors import NotFoundError
 from service.nets.detector import Detector
 from service.nets.pack import load_pack
 
@@ -31,7 +32,7 @@ def test_a_weight_file_becomes_a_pack(tmp_path: Path) -> None:
     config = replace(tiny_config(("person", "car", "truck")), width=0.125, max_width=160)
     torch.manual_seed(3)
     write_weights(Yolov3(config), tmp_path / "toy.weights", seen=64)
-    manifest = import_darknet(tmp_path / "toy.weights", config, tmp_path / "pack", renamed={"truck": "car"})
+    manifest = import_darknet(tmp_path / "toy.weights", config, tmp_path / "pack", renamed={"car": "car", "truck": "car"})
     pack = load_pack(str(tmp_path / "pack"))
     assert set(pack.networks) >= {"detector", "multibin", "depth"}
     assert manifest.training["detector"]["images_seen"] == 64
@@ -46,36 +47,15 @@ def test_a_weight_file_becomes_a_pack(tmp_path: Path) -> None:
 
 def test_the_metadata_describe_the_published_networks() -> None:
     for config in (Yolov3Config(classes=("a", "b")), tiny_config(("a", "b"))):
-        assert replace(config_of({**metadata_of(config), "network_classes": 2}), classes=("a", "b")) == config
+        assert replace(config_of({**yolov3_metadata(config), "network_classes": 2}), classes=("a", "b")) == config
 
 
-def test_classes_are_given_by_name_file_or_list(tmp_path: Path) -> None:
-    assert network_classes("coco")[2:8:5] == ("car", "truck")
-    assert len(set(network_classes("coco"))) == 80
-    (tmp_path / "my.names").write_text("car\nvan\n\n")
-    assert network_classes(str(tmp_path / "my.names")) == network_classes("car, van") == ("car", "van")
-    with pytest.raises(InputError, match="every class once"):
-        network_classes("car,car")
-
-
-def test_classes_are_mapped_by_name_and_as_told() -> None:
-    network = ("person", "car", "truck")
-    assert class_map(network, ("car",), {}) == {"1": "car"}
-    assert class_map(network, ("car",), parse_renames(["truck=car"])) == {"1": "car", "2": "car"}
-    for renamed in ({"lorry": "car"}, {"truck": "lorry"}):
-        with pytest.raises(InputError, match="lorry"):
-            class_map(network, ("car",), renamed)
-    with pytest.raises(InputError, match="no class of car"):
-        class_map(("person",), ("car",), {})
-    with pytest.raises(InputError, match="THEIRS=OURS"):
-        parse_renames(["truck"])
-
-
-def test_anchors_are_shared_out_over_the_scales() -> None:
-    assert parse_anchors("1,2, 3,4, 5,6, 7,8", 2) == (((1, 2), (3, 4)), ((5, 6), (7, 8)))
-    for wrong in ("1,2,3", "1,2,3,4,5,6", "a,b,c,d"):
-        with pytest.raises(InputError, match="anchors"):
-            parse_anchors(wrong, 2)
+def test_anchors_that_do_not_fit_the_network_are_refused(tmp_path: Path) -> None:
+    command = [str(tmp_path / "none.weights"), "--tiny", "--out", str(tmp_path / "pack"), "--anchors"]
+    for anchors in ("1,2 3,4 5,6", "10x13", "1,2 3,4 / 5,6"):
+        done = CliRunner().invoke(app, [*command, anchors])
+        assert done.exit_code == 1
+        assert "anchors" in done.output
 
 
 def test_the_real_tiny_network_finds_the_cars_of_a_real_drive(tmp_path: Path) -> None:
@@ -86,8 +66,8 @@ def test_the_real_tiny_network_finds_the_cars_of_a_real_drive(tmp_path: Path) ->
         clip = open_pandaset(recording(PANDASET_CLIP))
     except NotFoundError as error:
         pytest.skip(str(error))
-    config = tiny_config(network_classes("coco"), max_width=640)
-    import_darknet(weights, config, tmp_path / "pack", renamed={"truck": "car", "bus": "car"})
+    config = tiny_config(COCO_CLASSES, max_width=640)
+    import_darknet(weights, config, tmp_path / "pack", renamed=dict.fromkeys(("car", "truck", "bus"), "car"))
     network = load_pack(str(tmp_path / "pack")).networks["detector"]
     frames = list(drive_frames(clip, 30))
     (ours,) = score_drive(Detector(network), 640, frames, [0.3])
