@@ -11,10 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import onnx
 import torch
-from numpy.typing import NDArray
 from torch import nn
 from torch.export import Dim
 
@@ -92,6 +90,7 @@ def write_pack(
     classes: Sequence[str],
     training: Mapping[str, Any],
     scores: Mapping[str, Any],
+    licence: str = "Apache-2.0",
 ) -> Manifest:
     """Write files and manifest of a pack, after each file was opened once as the service will open it."""
     out.mkdir(parents=True, exist_ok=True)
@@ -109,7 +108,7 @@ def write_pack(
     manifest = Manifest(
         name=name,
         version=version,
-        licence="Apache-2.0",
+        licence=licence,
         classes=list(classes),
         networks=entries,
         training=dict(training),
@@ -117,11 +116,6 @@ def write_pack(
     )
     (out / "manifest.json").write_text(json.dumps(manifest.model_dump(), indent=1) + "\n", encoding="utf-8")
     return manifest
-
-
-def canvases_of(images: Sequence[NDArray[np.uint8]], batch: int = 4) -> list[NDArray[np.uint8]]:
-    """Equal-sized canvases in batches, for calibration."""
-    return [np.stack(images[i : i + batch]) for i in range(0, len(images) - batch + 1, batch)]
 
 
 def _strip_source_paths(model: onnx.ModelProto) -> None:
