@@ -22,7 +22,7 @@ from service.errors import InputError
 from service.nets.canvas import InputFit
 from service.nets.detector_spec import DetectorSpec, Format
 from service.nets.error_model import ErrorModel
-from service.nets.pack import Manifest, load_pack, open_network, session_options
+from service.nets.pack import Manifest, Pack, load_pack, open_network, session_options
 
 UNKNOWN_LICENCE = "unknown: as the model's author says"
 VERSION = "1"
@@ -73,12 +73,44 @@ def import_detector(request: ImportRequest) -> Manifest:
     base = load_pack(request.base, provider="cpu")
     if request.out.resolve() == base.path.resolve():
         raise InputError("it is the base pack's own folder.", field="--out", remedy="Give another folder.")
+    detector, scores, origin = _wrapped(request, base)
+    others = [
+        Exported(name, (base.path / entry.file).read_bytes(), entry.precision, entry.parameters)
+        for name, entry in base.manifest.networks.items()
+        if name != "detector"
+    ]
+    return write_pack(
+        request.out,
+        [detector, *others],
+        name=request.out.resolve().name,
+        version=VERSION,
+        classes=base.manifest.classes,
+        training={"detector": origin, "base": _base(base.manifest)},
+        scores={**base.manifest.scores, "detector": scores},
+        licence=f"detector: {request.licence}; other networks: {base.manifest.licence}",
+    )
+
+
+def _wrapped(request: ImportRequest, base: Pack) -> tuple[Exported, dict[str, float], dict[str, Any]]:
+    """The wrapped and checked detector, its scores, and where it comes from."""
     ids = class_ids(request.classes, base.manifest.classes, request.class_map)
     graph = read_graph(request.model, request.size)
     normalisation, fit = _input(request, graph.size)
     canvas = fit.batches([_drawn_image() if request.image is None else request.image])[0].pixels
     original = _Original(request.model, graph)
     reading, expected = _read(request, graph, original, normalisation.apply(canvas))
+    metadata = _metadata(request, base, ids, fit, reading)
+    two = normalisation.apply(np.concatenate([canvas, canvas]))
+    batched = graph.is_batched and original.keeps_batches(two, reading.outputs)
+    model = with_metadata(wrap(graph, normalisation, reading.outputs, batched=batched), metadata)
+    difference = relative_difference(expected, open_network("detector", model).run(canvas), "detector")
+    require_small(difference, "detector", "The wrapping changed the network")
+    scores = {"parity_with_original": float(f"{difference:.2e}")}
+    return Exported("detector", model, graph.precision, graph.parameters), scores, _origin(request, normalisation)
+
+
+def _metadata(request: ImportRequest, base: Pack, ids: Mapping[int, str], fit: InputFit, reading: Reading) -> dict[str, Any]:
+    """The detector's metadata, as the service's own reader accepts it."""
     base_spec = DetectorSpec.from_metadata(base.networks["detector"].metadata)
     metadata = {
         "format": request.format,
@@ -91,28 +123,7 @@ def import_detector(request: ImportRequest) -> Manifest:
         **reading.metadata,
     }
     DetectorSpec.from_metadata(metadata)
-    batched = graph.is_batched and original.keeps_batches(
-        normalisation.apply(np.concatenate([canvas, canvas])), reading.outputs
-    )
-    model = with_metadata(wrap(graph, normalisation, reading.outputs, batched=batched), metadata)
-    difference = relative_difference(expected, open_network("detector", model).run(canvas), "detector")
-    require_small(difference, "detector", "The wrapping changed the network")
-    detector = Exported("detector", model, graph.precision, graph.parameters)
-    others = [
-        Exported(name, (base.path / entry.file).read_bytes(), entry.precision, entry.parameters)
-        for name, entry in base.manifest.networks.items()
-        if name != "detector"
-    ]
-    return write_pack(
-        request.out,
-        [detector, *others],
-        name=request.out.resolve().name,
-        version=VERSION,
-        classes=base.manifest.classes,
-        training={"detector": _origin(request, normalisation), "base": _base(base.manifest)},
-        scores={"detector": {"parity_with_original": float(f"{difference:.2e}")}} | _without_detector(base.manifest.scores),
-        licence=f"detector: {request.licence}; other networks: {base.manifest.licence}",
-    )
+    return metadata
 
 
 class _Original:
@@ -192,10 +203,6 @@ def _origin(request: ImportRequest, normalisation: Normalisation) -> dict[str, A
 
 def _base(manifest: Manifest) -> dict[str, Any]:
     return {"name": manifest.name, "version": manifest.version, "training": manifest.training}
-
-
-def _without_detector(scores: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in scores.items() if name != "detector"}
 
 
 def _drawn_image() -> Pixels:
