@@ -16,6 +16,8 @@ from rich.console import Console
 from torch import nn
 
 from models_export.data.dataset import list_scenes
+from models_export.data.mix import MixConfig
+from models_export.data.real import RealData
 from models_export.data.samples import Sample, load_samples, split_scenes
 from models_export.export import Exported, canvases_of, to_onnx, with_metadata, write_pack
 from models_export.nets.blocks import parameter_count
@@ -77,29 +79,42 @@ class EdgeRecipe:
             "depth": TrainConfig(steps=2500, batch_size=16, learning_rate=1e-3),
         }
     )
+    mix: MixConfig = field(default_factory=MixConfig)
+    """Shares of the data sets in what the detector is given, where real recordings train too."""
     int8: tuple[str, ...] = NETWORKS
     """Networks that are quantized."""
 
 
-def train(network: str, data: Sequence[Path], out: Path, recipe: EdgeRecipe, *, resume: bool = False) -> nn.Module:
+def train(
+    network: str,
+    data: Sequence[Path],
+    out: Path,
+    recipe: EdgeRecipe,
+    *,
+    real: RealData | None = None,
+    resume: bool = False,
+) -> nn.Module:
     """Train one network of the pack on the training scenes of ``data``; checkpoints, log and curve go to ``out``.
 
-    Raises InputError for an unknown network or too little data.
+    ``real`` adds recordings to the detector's frames and to the multi-bin head's vehicles. Raises InputError for an unknown
+    network or too little data, NotFoundError for a recording that is not there.
     """
     if network not in NETWORKS:
         raise InputError(f"'{network}' is no network of this pack.", field="network", remedy=f"One of {', '.join(NETWORKS)}.")
-    training, held_out = split_scenes(data)
-    samples = _load(training, recipe)
+    training, held_out = (_load(scenes, recipe) for scenes in split_scenes(data))
+    classes, max_width = recipe.detector.classes, recipe.detector.max_width
     # Before the network is made: its first weights are drawn.
     torch.manual_seed(recipe.training[network].seed)
-    task: DetectorTask | MultibinTask | DepthTask
     if network == "detector":
-        task = DetectorTask(samples, recipe.detector)
-    elif network == "multibin":
-        task = MultibinTask(samples, recipe.multibin)
-    else:
-        task = DepthTask(samples, recipe.depth)
-    return fit(task, recipe.training[network], out, task.held_out(_load(held_out, recipe)), resume=resume)
+        added, checked = real.detection(classes, max_width) if real else ([], [])
+        detector = DetectorTask([*training, *added], recipe.detector, mix=recipe.mix if real else None)
+        return fit(detector, recipe.training[network], out, detector.held_out([*held_out, *checked]), resume=resume)
+    if network == "multibin":
+        turned, verified = real.vehicles(classes, max_width) if real else ([], [])
+        head = MultibinTask([*training, *turned], recipe.multibin)
+        return fit(head, recipe.training[network], out, head.held_out([*held_out, *verified]), resume=resume)
+    depth = DepthTask(training, recipe.depth)
+    return fit(depth, recipe.training[network], out, depth.held_out(held_out), resume=resume)
 
 
 def export(runs: Path, data: Sequence[Path], out: Path, recipe: EdgeRecipe, console: Console | None = None) -> Manifest:
