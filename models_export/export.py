@@ -22,6 +22,7 @@ from service.nets.canvas import ALIGN_PX
 from service.nets.pack import METADATA_KEY, Manifest, NetworkEntry, open_network
 
 OPSET = 20
+"""ONNX operator set of every exported graph; ONNX Runtime runs it since 1.17."""
 _EXAMPLE_BATCH = 2
 _MAX_TILES = 60
 
@@ -58,6 +59,17 @@ def to_onnx(net: nn.Module, name: str, example_hw: tuple[int, int], outputs: Seq
     model.graph.name = name
     _strip_source_paths(model)
     return bytes(model.SerializeToString())
+
+
+def fixed_batch(model: bytes, size: int) -> bytes:
+    """A copy of an exported model that takes ``size`` images a run, no more and no fewer."""
+    proto = onnx.load_from_string(model)
+    symbol = proto.graph.input[0].type.tensor_type.shape.dim[0].dim_param
+    for value in [*proto.graph.input, *proto.graph.output, *proto.graph.value_info]:
+        for dim in value.type.tensor_type.shape.dim:
+            if dim.dim_param == symbol:
+                dim.dim_value = size
+    return bytes(proto.SerializeToString())
 
 
 def with_metadata(model: bytes, metadata: Mapping[str, Any]) -> bytes:

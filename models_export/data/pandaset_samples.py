@@ -1,8 +1,8 @@
 """PandaSet frames (CC BY 4.0) as samples of detector and multi-bin head: cuboids projected into the vehicle's six cameras.
 
-PandaSet does not say what a camera sees of a cuboid. Cuboids hide each other here, drawn from far to near; what walls and hedges
-hide is not known. Steps at the end of the drive are kept out of training: the same street, and many of the same parked cars,
-a few seconds later.
+PandaSet does not say what a camera sees of a cuboid. Cuboids hide each other here, drawn from far to near; what walls and
+hedges hide is not known. Steps at the end of the drive are kept out of training: the same street, and many of the same parked
+cars, a few seconds later.
 """
 
 from __future__ import annotations

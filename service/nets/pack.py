@@ -63,13 +63,23 @@ class Network:
     metadata: dict[str, Any]
 
     def run(self, batch: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
-        """All outputs, in the graph's order, for one input batch (B, ...); a graph for one at a time runs B times."""
-        graph_input = self.session.get_inputs()[0]
-        if graph_input.shape[0] != 1 or len(batch) == 1:
-            outputs: list[NDArray[np.float32]] = self.session.run(None, {graph_input.name: batch})
-            return outputs
-        single = [self.session.run(None, {graph_input.name: batch[row : row + 1]}) for row in range(len(batch))]
-        return [np.concatenate(rows) for rows in zip(*single, strict=True)]
+        """All outputs, in the graph's order, for one input batch.
+
+        A network that was exported for batches of one size gets the batch in parts of it, the last filled up with zeros.
+        """
+        size = self.session.get_inputs()[0].shape[0]
+        if not isinstance(size, int) or len(batch) == size:
+            return self._run(batch)
+        parts = []
+        for start in range(0, len(batch), size):
+            part = np.zeros((size, *batch.shape[1:]), batch.dtype)
+            part[: len(batch) - start] = batch[start : start + size]
+            parts.append(self._run(part))
+        return [np.concatenate(outputs)[: len(batch)] for outputs in zip(*parts, strict=True)]
+
+    def _run(self, batch: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
+        outputs: list[NDArray[np.float32]] = self.session.run(None, {self.session.get_inputs()[0].name: batch})
+        return outputs
 
 
 @dataclass(frozen=True, eq=False)
