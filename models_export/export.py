@@ -92,6 +92,7 @@ def write_pack(
     classes: Sequence[str],
     training: Mapping[str, Any],
     scores: Mapping[str, Any],
+    licence: str = "Apache-2.0",
 ) -> Manifest:
     """Write files and manifest of a pack, after each file was opened once as the service will open it."""
     out.mkdir(parents=True, exist_ok=True)
@@ -109,7 +110,7 @@ def write_pack(
     manifest = Manifest(
         name=name,
         version=version,
-        licence="Apache-2.0",
+        licence=licence,
         classes=list(classes),
         networks=entries,
         training=dict(training),

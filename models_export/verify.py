@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -13,11 +14,28 @@ from torch import nn
 from service.errors import PackError
 from service.nets.pack import Network
 
-MAX_RELATIVE_DIFFERENCE = {"fp32": 1e-3, "fp16": 1e-2}
+Precision = Literal["fp32", "fp16"]
+
+MAX_RELATIVE_DIFFERENCE: dict[Precision, float] = {"fp32": 1e-3, "fp16": 1e-2}
 """Largest absolute difference of an output over that output's range, by the precision of the exported network.
 
 float16 keeps 11 bits, so that each rounding moves a value by up to 5e-4 of itself, and a deep network rounds many times.
 """
+
+
+@dataclass(frozen=True, eq=False)
+class TorchNetwork:
+    """A torch network with the face of :class:`service.nets.pack.Network`, for what decodes its outputs."""
+
+    name: str
+    net: nn.Module
+    metadata: dict[str, Any]
+
+    def run(self, batch: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
+        """All outputs for one input batch."""
+        with torch.inference_mode():
+            outputs = self.net(torch.from_numpy(batch))
+        return [output.numpy() for output in (outputs if isinstance(outputs, tuple) else (outputs,))]
 
 
 def parity(net: nn.Module, network: Network, inputs: Sequence[NDArray[np.uint8]]) -> float:
@@ -25,29 +43,36 @@ def parity(net: nn.Module, network: Network, inputs: Sequence[NDArray[np.uint8]]
 
     inputs: batches (B, H, W, 3) uint8; give several shapes, non-square ones among them.
     """
-    worst = 0.0
-    for batch in inputs:
-        with torch.inference_mode():
-            expected = net(torch.from_numpy(batch))
-        expected = expected if isinstance(expected, tuple) else (expected,)
-        for ours, theirs in zip(expected, network.run(batch), strict=True):
-            reference = ours.numpy()
-            if reference.shape != theirs.shape:
-                raise PackError(f"shape {theirs.shape}, torch gives {reference.shape}.", field=network.name)
-            span = float(np.ptp(reference)) or 1.0
-            worst = max(worst, float(np.abs(reference - theirs).max()) / span)
-    return worst
+    original = TorchNetwork(network.name, net, network.metadata)
+    return max((relative_difference(original.run(batch), network.run(batch), network.name) for batch in inputs), default=0.0)
 
 
 def require_parity(
-    net: nn.Module, network: Network, inputs: Sequence[NDArray[np.uint8]], precision: Literal["fp32", "fp16"] = "fp32"
+    net: nn.Module, network: Network, inputs: Sequence[NDArray[np.uint8]], precision: Precision = "fp32"
 ) -> float:
     """:func:`parity`, raising PackError when it exceeds ``MAX_RELATIVE_DIFFERENCE`` of the precision."""
-    worst, accepted = parity(net, network, inputs), MAX_RELATIVE_DIFFERENCE[precision]
-    if not worst <= accepted:
-        raise PackError(
-            f"torch and ONNX Runtime differ by {worst:.2e} of the output's range.",
-            field=network.name,
-            remedy=f"The exporter changed the network; {precision} may differ by {accepted:.0e}.",
-        )
+    return require_small(parity(net, network, inputs), network.name, "The exporter changed the network", precision)
+
+
+def relative_difference(expected: Sequence[NDArray[Any]], found: Sequence[NDArray[Any]], name: str) -> float:
+    """Largest absolute difference of outputs over each output's range. Raises PackError where shapes differ."""
+    worst = 0.0
+    for reference, output in zip(expected, found, strict=True):
+        if reference.shape != output.shape:
+            raise PackError(f"shape {output.shape}, the original gives {reference.shape}.", field=name)
+        reference, output = reference.astype(np.float64), output.astype(np.float64)
+        span = float(np.ptp(reference)) or 1.0
+        worst = max(worst, float(np.abs(reference - output).max()) / span)
     return worst
+
+
+def require_small(difference: float, name: str, reason: str, precision: Precision = "fp32") -> float:
+    """The difference, raising PackError with the reason when it exceeds ``MAX_RELATIVE_DIFFERENCE`` of the precision."""
+    accepted = MAX_RELATIVE_DIFFERENCE[precision]
+    if not difference <= accepted:
+        raise PackError(
+            f"the original and the pack's network differ by {difference:.2e} of the output's range.",
+            field=name,
+            remedy=f"{reason}; {precision} may differ by {accepted:.0e}.",
+        )
+    return difference

@@ -94,7 +94,7 @@ def create_app(
 
 
 def default_pipeline(settings: Settings) -> FrameSetRunner:
-    """The service's own pipeline on the pack that the settings name. Raises PackError."""
+    """The service's own pipeline on the pack that the settings name. Raises PackError or InputError."""
     from service.nets.pack import load_pack
     from service.pipeline import Pipeline, PipelineSettings
 
@@ -102,7 +102,7 @@ def default_pipeline(settings: Settings) -> FrameSetRunner:
     options = (
         PipelineSettings() if threshold is None else PipelineSettings(score_threshold=threshold, min_fused_score=threshold)
     )
-    return Pipeline(load_pack(settings.pack, intra_op_threads=1), options)
+    return Pipeline(load_pack(settings.pack, provider=settings.provider), options)
 
 
 def open_store(settings: Settings) -> SitesStore:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.recordings import recording
+from benchmarks.recordings import PANDASET_CLIP, recording
 from models_export.data.pandaset import PandasetClip, boxes_of, open_pandaset, rotation_of
 from service.errors import InputError, NotFoundError
 from service.geometry.boxes import project_extents
@@ -25,7 +25,7 @@ def cuboid(uuid: str, **changes: Any) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def drive() -> PandasetClip:
     try:
-        return open_pandaset(recording("pandaset_clip.zip"))
+        return open_pandaset(recording(PANDASET_CLIP))
     except NotFoundError as error:
         pytest.skip(str(error))
 
