@@ -22,7 +22,7 @@ from models_export.data.mix import MixConfig, draw_by_odds, draw_odds
 from models_export.losses import ciou
 from models_export.nets.detector import DetectorConfig, EdgeDetector
 from models_export.train.detector_pictures import UNKNOWN_CLASS, canvas_of, stacked, strips_on
-from models_export.train.task import Batch, ParameterGroup, decayed_groups, draw_uniform
+from models_export.train.task import Batch, ParameterGroup, decayed_groups
 from service.geometry.transforms import Array
 from service.nets.decoding import BOX_FIELDS
 
@@ -46,13 +46,12 @@ class DetectorTask:
         augment: AugmentConfig | None = None,
         mix: MixConfig | None = None,
     ) -> None:
-        """Without a mix every sample is as likely as the others."""
         self.samples = samples
-        self.mix = mix
-        self.odds = draw_odds([sample.source for sample in samples], mix) if mix else None
+        self.mix = mix or MixConfig()
+        self.odds = draw_odds([sample.source for sample in samples], self.mix)
         self.canvas_px: tuple[int, int] | None = canvas_of(samples)
-        drawn = samples if mix is None else [samples[i] for i in self.draw(np.random.default_rng(0), _ANCHOR_DRAWS)]
-        self.config = replace(config, anchors_px=anchors_of(drawn, config.strides))
+        drawn = self.draw(np.random.default_rng(0), _ANCHOR_DRAWS)
+        self.config = replace(config, anchors_px=anchors_of([samples[i] for i in drawn], config.strides))
         self.augment = augment or AugmentConfig()
         self.net = EdgeDetector(self.config)
 
@@ -63,7 +62,7 @@ class DetectorTask:
             "net": asdict(self.config),
             "augment": asdict(self.augment),
             "samples": dict(sorted(sources.items())),
-            "mix": asdict(self.mix) if self.mix else None,
+            "mix": asdict(self.mix),
         }
 
     def __len__(self) -> int:
@@ -72,12 +71,13 @@ class DetectorTask:
     def held_out(self, samples: Sequence[DetectionSample]) -> DetectorTask:
         """The same network and configuration over other samples, as they are, each on its own canvas: for validation."""
         other = copy(self)
-        other.samples, other.augment, other.odds, other.canvas_px = samples, NO_AUGMENT, None, None
+        other.samples, other.augment, other.canvas_px = samples, NO_AUGMENT, None
+        other.odds = draw_odds([sample.source for sample in samples], self.mix)
         return other
 
     def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.int64]:
         """Samples by the shares of the mix."""
-        return draw_uniform(rng, len(self), size) if self.odds is None else draw_by_odds(rng, self.odds, size)
+        return draw_by_odds(rng, self.odds, size)
 
     def labels(self, index: int) -> dict[str, str]:
         """Camera and weather of a simulated frame, source of a real one."""

@@ -56,7 +56,7 @@ def _toy_sample(rng: np.random.Generator, camera: Camera) -> Sample:
         ignore=np.zeros(2, dtype=bool),
         cls=np.zeros(2, np.int64),
         class_known=np.ones(2, dtype=bool),
-        source="toy",
+        source="simulated/toy",
         dims_lwh=rng.normal([4.4, 1.8, 1.5], 0.1, (2, 3)),
         alpha=rng.uniform(-np.pi, np.pi, 2),
         visible=np.ones(2),
