@@ -1,24 +1,21 @@
-"""Training of the detector: batches, anchors, target assignment, loss, validation."""
+"""Training of the edge detector: target assignment and loss."""
 
 from __future__ import annotations
 
-from copy import copy
-from dataclasses import asdict, replace
-from typing import Any
+from dataclasses import replace
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from models_export.data.augment import NO_AUGMENT, AugmentConfig, flip_horizontally, photometric, rescale
-from models_export.data.samples import MIN_SIDE_PX, Sample
+from models_export.anchors import anchors_of, log_clusters
+from models_export.data.augment import AugmentConfig
+from models_export.data.samples import Sample
 from models_export.losses import ciou
 from models_export.nets.detector import DetectorConfig, EdgeDetector
-from models_export.train.task import Batch, ParameterGroup, decayed_groups, draw_uniform
-from service.geometry.transforms import Array
+from models_export.train.boxes import BoxTask
+from models_export.train.task import Batch
+from models_export.yolo_loss import covered_cells
 from service.nets.decoding import BOX_FIELDS
 
 MAX_RATIO = 4.0
@@ -28,86 +25,16 @@ SCALE_BALANCE = (4.0, 1.0, 0.4)
 BOX_WEIGHT, OBJECT_WEIGHT, CLASS_WEIGHT = 0.05, 1.0, 0.2
 
 
-class DetectorTask:
-    """The detector with its training samples."""
-
-    name = "detector"
+class DetectorTask(BoxTask):
+    """The edge detector with its training samples."""
 
     def __init__(self, samples: list[Sample], config: DetectorConfig, augment: AugmentConfig | None = None) -> None:
-        self.samples = samples
-        self.config = replace(config, anchors_px=anchors_of(samples, config.strides))
-        self.augment = augment or AugmentConfig()
-        self.net = EdgeDetector(self.config)
-
-    def describe(self) -> dict[str, Any]:
-        """Configuration of network, data and augmentation."""
-        return {"net": asdict(self.config), "augment": asdict(self.augment), "samples": len(self.samples)}
-
-    def __len__(self) -> int:
-        return len(self.samples)
-
-    def held_out(self, samples: list[Sample]) -> DetectorTask:
-        """The same network and configuration over other samples, which are not augmented: for validation."""
-        other = copy(self)
-        other.samples, other.augment = samples, NO_AUGMENT
-        return other
-
-    def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.int64]:
-        """Every frame is as likely as the others."""
-        return draw_uniform(rng, len(self), size)
-
-    def labels(self, index: int) -> dict[str, str]:
-        """Camera and weather of a frame."""
-        return self.samples[index].labels
-
-    def parameter_groups(self, net: nn.Module) -> list[ParameterGroup]:
-        """All of the network at one pace."""
-        return decayed_groups(net)
-
-    def batch(self, indices: NDArray[np.int64], rng: np.random.Generator) -> Batch:
-        """Images (B, H, W, 3) uint8; targets (T, 7): image, class, x0, y0, x1, y1 (px), ignore."""
-        images, targets = [], []
-        for row, index in enumerate(indices):
-            image, boxes = self._augmented(self.samples[index], rng)
-            images.append(image)
-            targets.append(np.concatenate([np.full((len(boxes), 1), float(row)), boxes], 1))
-        return {
-            "images": torch.from_numpy(np.stack(images)),
-            "targets": torch.from_numpy(np.concatenate(targets)).float().reshape(-1, 7),
-        }
+        config = replace(config, anchors_px=anchors_of(samples, config.strides, log_clusters))
+        super().__init__(samples, config, EdgeDetector(config), augment)
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
         """Box, objectness and class losses and their weighted sum."""
         return detector_loss([head.float() for head in net(batch["images"])], batch["targets"], self.config)
-
-    def _augmented(self, sample: Sample, rng: np.random.Generator) -> tuple[np.ndarray, Array]:
-        image, xyxy = sample.canvas, sample.xyxy_px
-        if rng.random() < self.augment.flip:
-            image, xyxy = flip_horizontally(image, xyxy, sample.image_size[0])
-        if rng.random() < self.augment.geometric:
-            image, xyxy = rescale(image, xyxy, rng, self.augment)
-        height, width = image.shape[:2]
-        clipped = np.clip(xyxy, 0, np.array([width - 1, height - 1] * 2))
-        sides, full = clipped[:, 2:] - clipped[:, :2], np.maximum(xyxy[:, 2:] - xyxy[:, :2], 1e-6)
-        kept = np.prod(sides, axis=1) / np.prod(full, axis=1)
-        ignore = sample.ignore | (sides.min(1, initial=np.inf) < MIN_SIDE_PX) | (kept < 0.3)
-        present = sides.min(1, initial=np.inf) > 1
-        rows = np.concatenate([sample.cls[:, None], clipped, ignore[:, None]], 1)
-        return photometric(image, rng, self.augment), rows[present]
-
-
-def anchors_of(
-    samples: list[Sample], strides: tuple[int, ...], per_scale: int = 3
-) -> tuple[tuple[tuple[float, float], ...], ...]:
-    """Anchors (width, height), px, by k-means over the logarithms of the boxes' sides: smallest for the finest stride.
-
-    Logarithms, for the decoding scales an anchor by a factor.
-    """
-    sides = np.concatenate([s.xyxy_px[~s.ignore][:, 2:] - s.xyxy_px[~s.ignore][:, :2] for s in samples])
-    centers, _ = kmeans2(np.log(sides), per_scale * len(strides), minit="++", seed=0, iter=50)
-    ordered = np.exp(centers[np.argsort(centers.sum(1))])
-    rows = [tuple((round(float(w), 1), round(float(h), 1)) for w, h in group) for group in np.split(ordered, len(strides))]
-    return tuple(rows)
 
 
 def detector_loss(heads: list[Tensor], targets: Tensor, config: DetectorConfig) -> dict[str, Tensor]:
@@ -132,7 +59,7 @@ def detector_loss(heads: list[Tensor], targets: Tensor, config: DetectorConfig) 
             wanted[index] = overlap.detach().clamp(min=0).to(wanted.dtype)
             one_hot = F.one_hot(truth[:, 1].long(), len(config.classes)).to(cells.dtype)
             classes = classes + F.binary_cross_entropy_with_logits(cells[:, BOX_FIELDS:], one_hot)
-        blamed = ~_covered(ignored, grid.shape, stride, grid.device) | (wanted > 0)
+        blamed = ~covered_cells(ignored, (len(grid), *grid.shape[2:4]), stride) | (wanted > 0)
         losses = F.binary_cross_entropy_with_logits(grid[..., 4], wanted, reduction="none")
         objectness = objectness + balance * (losses * blamed).mean()
     total = BOX_WEIGHT * box + OBJECT_WEIGHT * objectness + CLASS_WEIGHT * classes
@@ -173,14 +100,3 @@ def decode(cells: Tensor, index: tuple[Tensor, ...], stride: int, anchors: Tenso
     center = (2 * probability[:, :2] - 0.5 + place) * stride - 0.5
     half = 0.5 * (2 * probability[:, 2:4]) ** 2 * anchors[index[1]]
     return torch.cat([center - half, center + half], 1)
-
-
-def _covered(ignored: Tensor, shape: torch.Size, stride: int, device: torch.device) -> Tensor:
-    """Cells (B, 1, h, w) whose centre lies in an ignored box."""
-    batch, _, rows, columns, _ = shape
-    covered = torch.zeros((batch, 1, rows, columns), dtype=torch.bool, device=device)
-    x = (torch.arange(columns, device=device) + 0.5) * stride - 0.5
-    y = (torch.arange(rows, device=device) + 0.5) * stride - 0.5
-    for image, _, x0, y0, x1, y1, _ in ignored.tolist():
-        covered[int(image), 0] |= ((y >= y0) & (y <= y1))[:, None] & ((x >= x0) & (x <= x1))[None]
-    return covered
