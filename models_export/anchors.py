@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
-from models_export.data.samples import Sample
+from models_export.data.detection import DetectionSample
 from service.geometry.transforms import Array
 
 _MAX_ROUNDS = 100
@@ -17,7 +17,7 @@ Clusters = Callable[[Array, int], Array]
 
 
 def anchors_of(
-    samples: Sequence[Sample], strides: tuple[int, ...], clusters: Clusters, per_scale: int = 3
+    samples: Sequence[DetectionSample], strides: tuple[int, ...], clusters: Clusters, per_scale: int = 3
 ) -> tuple[tuple[tuple[float, float], ...], ...]:
     """Anchors (width, height), px, of the vehicles that count: smallest for the finest stride."""
     sides = np.concatenate([s.xyxy_px[~s.ignore][:, 2:] - s.xyxy_px[~s.ignore][:, :2] for s in samples])

@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from models_export.data.real import RealData
 from models_export.edge import edge_recipe
 from models_export.packing import ExportOptions, export
 from models_export.recipe import PackRecipe, train
@@ -49,6 +50,8 @@ def train_command(
     data: DataOption,
     pack: PackOption = PackName.EDGE,
     runs: RunsOption = None,
+    real: Annotated[Path | None, typer.Option(help="Folder of real recordings that train too.")] = None,
+    taught: Annotated[Path | None, typer.Option(help="What `quadlift teach` wrote of them.")] = None,
     steps: Annotated[int | None, typer.Option(help="Optimiser steps; the recipe's if left out.")] = None,
     epochs: Annotated[float | None, typer.Option(help="Passes over the data, instead of steps.")] = None,
     batch_size: Annotated[int | None, typer.Option(help="Items a step; the recipe's if left out.")] = None,
@@ -76,9 +79,11 @@ def train_command(
         names = recipe.names if network == ALL else (recipe.network(network).name,)
         if init is not None and network == ALL:
             raise InputError("is for one network.", field="init", remedy="Train the networks one by one.")
+        recordings = _recordings(real, taught)
         for name in names:
             config = _changed(recipe.network(name).training, changes)
-            train(recipe.with_training(name, config), name, data, runs or _runs(pack), init=init, resume=resume)
+            changed = recipe.with_training(name, config)
+            train(changed, name, data, runs or _runs(pack), real=recordings, init=init, resume=resume)
     except QuadliftError as error:
         raise _failed(error) from None
 
@@ -107,6 +112,12 @@ def export_command(
 
 def _recipe(pack: PackName) -> PackRecipe:
     return {PackName.EDGE: edge_recipe}[pack]()
+
+
+def _recordings(folder: Path | None, taught: Path | None) -> RealData | None:
+    if folder is None and taught is not None:
+        raise InputError("says nothing without recordings.", field="taught", remedy="Give their folder with --real.")
+    return None if folder is None else RealData(folder, taught)
 
 
 def _runs(pack: PackName) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from models_export.data.real import RealData
 from models_export.metadata import depth_metadata, detector_metadata, multibin_metadata
 from models_export.nets.depth import DepthConfig, EdgeDepth
 from models_export.nets.detector import DetectorConfig, EdgeDetector
@@ -37,6 +38,7 @@ def _detector(config: DetectorConfig) -> NetworkRecipe:
         training=TrainConfig(steps=4500, batch_size=16),
         outputs=("p8", "p16", "p32"),
         metadata=detector_metadata,
+        real=RealData.detection,
         precision="int8",
     )
 
@@ -50,6 +52,7 @@ def _multibin(config: MultibinConfig) -> NetworkRecipe:
         training=TrainConfig(steps=5000, batch_size=128, learning_rate=1e-3),
         outputs=("vectors", "confidence", "residual"),
         metadata=multibin_metadata,
+        real=RealData.vehicles,
         canvas_hw=(config.crop_px, config.crop_px),
         precision="int8",
     )

@@ -10,6 +10,8 @@ from typing import Any, Literal, Protocol
 import torch
 from torch import nn
 
+from models_export.data.detection import DetectionSample
+from models_export.data.real import RealData
 from models_export.data.samples import Sample, load_samples, split_scenes
 from models_export.train.checkpoint import load_averaged
 from models_export.train.config import TrainConfig
@@ -21,9 +23,9 @@ Precision = Literal["fp32", "fp16", "int8"]
 
 
 class SampleTask(Task, Protocol):
-    """A task over samples of scenes."""
+    """A task over samples of scenes, and of real recordings where the network's recipe takes them."""
 
-    def held_out(self, samples: list[Sample]) -> Task:
+    def held_out(self, samples: Sequence[Any]) -> Task:
         """The same network and configuration over other samples, which are not augmented: for validation."""
 
 
@@ -43,6 +45,11 @@ def unchanged(net: nn.Module) -> nn.Module:
     return net
 
 
+def no_samples(real: RealData, classes: tuple[str, ...], max_width: int) -> tuple[list[Sample], list[Sample]]:
+    """Recordings add nothing."""
+    return [], []
+
+
 @dataclass(frozen=True)
 class NetworkRecipe:
     """One network of a pack."""
@@ -53,7 +60,7 @@ class NetworkRecipe:
     """Frozen dataclass of the network's shape. The task replaces what the data decide: anchors, mean sizes."""
     build: Callable[[Any], nn.Module]
     """The network of a configuration."""
-    task: Callable[[list[Sample], Any], SampleTask]
+    task: Callable[[Sequence[Any], Any], SampleTask]
     """The task of training samples and a configuration."""
     training: TrainConfig
     outputs: tuple[str, ...]
@@ -61,11 +68,13 @@ class NetworkRecipe:
     metadata: Callable[[Any], dict[str, Any]]
     """Of the ONNX file, from the resolved configuration; what validation measures is added."""
     canvas_hw: tuple[int, int] | None = None
-    """Height and width of the only input that it takes, px; None: any multiple of 32 px."""
+    """Height and width of the only input that it takes, px: frames are scaled to fit. None: any multiple of 32 px."""
     precision: Precision = "fp32"
     """In which it is exported unless asked otherwise."""
     load_pretrained: Callable[[Any, Path], None] = load_checkpoint
     """Puts the weights of a user's file or folder into the network: what ``--init`` names."""
+    real: Callable[[RealData, tuple[str, ...], int], tuple[Sequence[DetectionSample], Sequence[DetectionSample]]] = no_samples
+    """What recordings add to the training and to the held-out samples, for given classes and width of images, px."""
     for_export: Callable[[Any], nn.Module] = unchanged
     """A network of the same outputs that runs faster, or that ONNX Runtime can run at all."""
 
@@ -105,22 +114,32 @@ class PackRecipe:
 
 
 def train(
-    recipe: PackRecipe, name: str, data: Sequence[Path], out: Path, *, init: Path | None = None, resume: bool = False
+    recipe: PackRecipe,
+    name: str,
+    data: Sequence[Path],
+    out: Path,
+    *,
+    real: RealData | None = None,
+    init: Path | None = None,
+    resume: bool = False,
 ) -> nn.Module:
     """Train one network on the training scenes of ``data``; checkpoint, logs and curves go to ``out``.
 
-    init: a file or folder of weights to start from; not read when resuming. Raises InputError for an unknown network, too
-    little data, and weights that do not fit.
+    real: recordings, for the networks that learn from them too. init: a file or folder of weights to start from; not read
+    when resuming. Raises InputError for an unknown network, too little data, and weights that do not fit, NotFoundError for
+    recordings that are not there.
     """
     network = recipe.network(name)
-    training, held_out = split_scenes(data)
+    training, held_out = (recipe.samples(scenes) for scenes in split_scenes(data))
+    detector = recipe.network("detector").config
+    added, checked = network.real(real, detector.classes, detector.max_width) if real else ([], [])
     # Before the network is made: its first weights are drawn.
     torch.manual_seed(network.training.seed)
-    task = network.task(recipe.samples(training), network.config)
+    task = network.task([*training, *added], network.config)
     if init is not None and not resume:
         network.load_pretrained(task.net, init)
     config = replace(network.training, init=None if init is None else init.name)
-    return fit(task, config, out, task.held_out(recipe.samples(held_out)), resume=resume)
+    return fit(task, config, out, task.held_out([*held_out, *checked]), resume=resume)
 
 
 def resolved_config(network: NetworkRecipe, saved: Mapping[str, Any]) -> Any:

@@ -62,8 +62,8 @@ class Predictions:
 def yolo_loss(heads: Sequence[Tensor], targets: Tensor, config: AnchoredConfig) -> dict[str, Tensor]:
     """Darknet's loss, summed over predictions and averaged over images.
 
-    heads: (B, A * (5 + C), h, w) logits a stride. targets (T, 7): image, class, x0, y0, x1, y1 (px), ignore. Ignored vehicles
-    are not asked for, and cells centred in them are not blamed.
+    heads: (B, A * (5 + C), h, w) logits a stride. targets (T, 7): image, class or -1, x0, y0, x1, y1 (px), ignore. Ignored
+    vehicles are not asked for, and cells centred in them are not blamed; an unknown class is not asked for.
     """
     found = flatten(heads, config)
     positives, ignored = targets[targets[:, 6] == 0], targets[targets[:, 6] != 0]
@@ -80,8 +80,9 @@ def yolo_loss(heads: Sequence[Tensor], targets: Tensor, config: AnchoredConfig) 
     center = ((truth[:, 2:4] + truth[:, 4:6]) / 2 + 0.5) / found.stride[place] - found.cell[place]
     sides = (size / found.anchor[place]).log()
     box = (scale * (_divergence(answers[:, :2], center) + 0.5 * (answers[:, 2:4] - sides) ** 2).sum(1)).sum()
-    one_hot = F.one_hot(truth[:, 1].long(), len(config.classes)).to(logits.dtype)
-    classes = F.binary_cross_entropy_with_logits(answers[:, BOX_FIELDS:], one_hot, reduction="sum")
+    known = truth[:, 1] >= 0
+    one_hot = F.one_hot(truth[known, 1].long(), len(config.classes)).to(logits.dtype)
+    classes = F.binary_cross_entropy_with_logits(answers[known, BOX_FIELDS:], one_hot, reduction="sum")
     terms = {"box": box / images, "objectness": objectness / images, "classes": classes / images}
     return {"total": terms["box"] + terms["objectness"] + terms["classes"], **terms}
 

@@ -43,7 +43,7 @@ class TrainConfig:
     milestones: tuple[float, ...] = (0.8, 0.9)
     """Of ``multistep``: parts of the run."""
     ema_decay: float = 0.998
-    """Decay of the averaged weights, which are what is validated and exported."""
+    """Decay of the averaged weights, which are what is validated and exported; after n steps at most (1 + n) / (10 + n)."""
     clip_norm: float = 5.0
     """Largest norm of the gradient."""
     seed: int = 1

@@ -65,16 +65,16 @@ def _draw(path: Path, title: str, lines: Sequence[Line]) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    figure, axes = plt.subplots(figsize=(7, 4))
+    figure, axes = plt.subplots(figsize=(9, 4.5), layout="constrained")
+    axes.set_prop_cycle(color=matplotlib.color_sequences["tab10" if len(lines) <= 10 else "tab20"])
     for label, steps, losses in lines:
         if label == TRAINING:
-            axes.plot(steps, losses, label=label, color="0.75", zorder=1)
+            axes.plot(steps, losses, label=label, color="0.8", zorder=1)
         else:
             axes.plot(steps, losses, label=label, marker="." if len(steps) <= 30 else None)
     axes.set(title=title, xlabel="step", ylabel="loss", yscale="log")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize="small")
-    figure.tight_layout()
+    figure.legend(loc="outside right upper", fontsize="small")
     figure.savefig(path, dpi=120)
     plt.close(figure)
 

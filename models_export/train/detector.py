@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from models_export.anchors import anchors_of, log_clusters
+from models_export.anchors import log_clusters
 from models_export.data.augment import AugmentConfig
-from models_export.data.samples import Sample
+from models_export.data.detection import DetectionSample
+from models_export.data.mix import MixConfig
 from models_export.losses import ciou
 from models_export.nets.detector import DetectorConfig, EdgeDetector
 from models_export.train.boxes import BoxTask
+from models_export.train.detector_pictures import UNKNOWN_CLASS
 from models_export.train.task import Batch
 from models_export.yolo_loss import covered_cells
 from service.nets.decoding import BOX_FIELDS
@@ -28,9 +30,14 @@ BOX_WEIGHT, OBJECT_WEIGHT, CLASS_WEIGHT = 0.05, 1.0, 0.2
 class DetectorTask(BoxTask):
     """The edge detector with its training samples."""
 
-    def __init__(self, samples: list[Sample], config: DetectorConfig, augment: AugmentConfig | None = None) -> None:
-        config = replace(config, anchors_px=anchors_of(samples, config.strides, log_clusters))
-        super().__init__(samples, config, EdgeDetector(config), augment)
+    def __init__(
+        self,
+        samples: Sequence[DetectionSample],
+        config: DetectorConfig,
+        augment: AugmentConfig | None = None,
+        mix: MixConfig | None = None,
+    ) -> None:
+        super().__init__(samples, config, EdgeDetector, log_clusters, augment, mix)
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
         """Box, objectness and class losses and their weighted sum."""
@@ -40,9 +47,9 @@ class DetectorTask(BoxTask):
 def detector_loss(heads: list[Tensor], targets: Tensor, config: DetectorConfig) -> dict[str, Tensor]:
     """YOLO's loss over all scales.
 
-    heads: (B, A * (5 + C), h, w) logits a stride. targets (T, 7): image, class, x0, y0, x1, y1 (px), ignore. Complete IoU
-    for boxes; binary cross entropy for objectness, whose target is the IoU reached; cells centred in ignored boxes are
-    left out of the objectness unless they answer for a vehicle.
+    heads: (B, A * (5 + C), h, w) logits a stride. targets (T, 7): image, class or -1, x0, y0, x1, y1 (px), ignore. Complete
+    IoU for boxes; binary cross entropy for objectness, whose target is the IoU reached; cells centred in ignored boxes are
+    left out of the objectness unless they answer for a vehicle; targets of unknown class are left out of the class's loss.
     """
     positives = targets[targets[:, 6] == 0]
     ignored = targets[targets[:, 6] != 0]
@@ -57,13 +64,20 @@ def detector_loss(heads: list[Tensor], targets: Tensor, config: DetectorConfig) 
             overlap = ciou(decode(cells, index, stride, head.new_tensor(anchors)), truth[:, 2:6])
             box = box + (1 - overlap).mean()
             wanted[index] = overlap.detach().clamp(min=0).to(wanted.dtype)
-            one_hot = F.one_hot(truth[:, 1].long(), len(config.classes)).to(cells.dtype)
-            classes = classes + F.binary_cross_entropy_with_logits(cells[:, BOX_FIELDS:], one_hot)
+            classes = classes + _class_loss(cells[:, BOX_FIELDS:], truth[:, 1].long())
         blamed = ~covered_cells(ignored, (len(grid), *grid.shape[2:4]), stride) | (wanted > 0)
         losses = F.binary_cross_entropy_with_logits(grid[..., 4], wanted, reduction="none")
         objectness = objectness + balance * (losses * blamed).mean()
     total = BOX_WEIGHT * box + OBJECT_WEIGHT * objectness + CLASS_WEIGHT * classes
     return {"total": total, "box": box, "objectness": objectness, "classes": classes}
+
+
+def _class_loss(logits: Tensor, cls: Tensor) -> Tensor:
+    """Mean binary cross entropy of logits (P, C) over the targets (P,) whose class is known; 0 when there are none."""
+    known = cls != UNKNOWN_CLASS
+    one_hot = F.one_hot(cls.clamp(min=0), logits.shape[1]).to(logits.dtype)
+    losses = F.binary_cross_entropy_with_logits(logits, one_hot, reduction="none").mean(1)
+    return (losses * known).sum() / known.sum().clamp(min=1)
 
 
 def assign(targets: Tensor, grid_shape: tuple[int, int], stride: int, anchors: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:

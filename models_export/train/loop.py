@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from torch import nn
+from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from models_export.train.checkpoint import read_checkpoint, require_same, write_checkpoint
@@ -67,7 +67,7 @@ class _Run:
         self.task, self.config, self.checkpoint = task, config, checkpoint
         device = _device(config.device)
         self.net = task.net.to(device, memory_format=torch.channels_last).train()
-        self.averaged = AveragedModel(self.net, multi_avg_fn=get_ema_multi_avg_fn(config.ema_decay), use_buffers=True)
+        self.averaged = AveragedModel(self.net, multi_avg_fn=_average(config.ema_decay), use_buffers=True)
         self.groups = task.parameter_groups(self.net)
         self.optimizer = _optimizer(self.groups, config)
         self.scaler = torch.amp.GradScaler(device.type, enabled=config.amp and config.amp_dtype == "float16")
@@ -129,6 +129,15 @@ def _device(name: str) -> torch.device:
     except (RuntimeError, AssertionError) as error:
         raise InputError(f"cannot be used: {error}", field="device", remedy="'cpu' always works.") from error
     return device
+
+
+def _average(decay: float) -> Callable[[list[Tensor], list[Tensor], Tensor | int], None]:
+    def update(averaged: list[Tensor], current: list[Tensor], count: Tensor | int) -> None:
+        # Short memory at first: otherwise a short run's average is still mostly the untrained network.
+        seen = int(count)
+        get_ema_multi_avg_fn(min(decay, (1 + seen) / (10 + seen)))(averaged, current, count)
+
+    return update
 
 
 def _optimizer(groups: list[ParameterGroup], config: TrainConfig) -> torch.optim.Optimizer:

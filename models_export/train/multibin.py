@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import asdict, replace
 from typing import Any
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from models_export.data.augment import NO_AUGMENT, AugmentConfig, photometric
-from models_export.data.samples import Sample
+from models_export.data.detection import VehicleSample
 from models_export.losses import multibin_loss
 from models_export.nets.multibin import EdgeMultibin, MultibinConfig
 from models_export.train.task import Batch, ParameterGroup, decayed_groups, draw_uniform
@@ -29,7 +30,7 @@ class MultibinTask:
 
     name = "multibin"
 
-    def __init__(self, samples: list[Sample], config: MultibinConfig, augment: AugmentConfig | None = None) -> None:
+    def __init__(self, samples: Sequence[VehicleSample], config: MultibinConfig, augment: AugmentConfig | None = None) -> None:
         self.samples = samples
         self.vehicles = vehicles_of(samples)
         self.config = replace(config, mean_dims_lwh=mean_dims(samples, len(config.classes)))
@@ -43,7 +44,7 @@ class MultibinTask:
     def __len__(self) -> int:
         return len(self.vehicles)
 
-    def held_out(self, samples: list[Sample]) -> MultibinTask:
+    def held_out(self, samples: Sequence[VehicleSample]) -> MultibinTask:
         """The same network and configuration over other samples, which are not augmented: for validation."""
         other = copy(self)
         other.samples, other.augment = samples, NO_AUGMENT
@@ -89,13 +90,13 @@ class MultibinTask:
         )
 
 
-def vehicles_of(samples: list[Sample]) -> NDArray[np.int64]:
-    """(V, 2) sample and row of every vehicle that counts."""
-    found = [(i, j) for i, s in enumerate(samples) for j in np.flatnonzero(~s.ignore)]
+def vehicles_of(samples: Sequence[VehicleSample]) -> NDArray[np.int64]:
+    """(V, 2) sample and row of every vehicle that counts and whose class is known."""
+    found = [(i, j) for i, s in enumerate(samples) for j in np.flatnonzero(~s.ignore & s.class_known)]
     return np.array(found, dtype=np.int64).reshape(-1, 2)
 
 
-def mean_dims(samples: list[Sample], classes: int) -> tuple[tuple[float, float, float], ...]:
+def mean_dims(samples: Sequence[VehicleSample], classes: int) -> tuple[tuple[float, float, float], ...]:
     """Mean length, width, height of each class's vehicles, metres; a class without vehicles gets the mean of all."""
     dims = np.concatenate([s.dims_lwh[~s.ignore] for s in samples])
     cls = np.concatenate([s.cls[~s.ignore] for s in samples])
@@ -103,7 +104,7 @@ def mean_dims(samples: list[Sample], classes: int) -> tuple[tuple[float, float, 
     return tuple((float(m[0]), float(m[1]), float(m[2])) for m in (np.round(r.mean(0), 4) for r in rows))
 
 
-def _jittered(sample: Sample, row: int, rng: np.random.Generator, crop_px: int) -> tuple[np.ndarray, float]:
+def _jittered(sample: VehicleSample, row: int, rng: np.random.Generator, crop_px: int) -> tuple[np.ndarray, float]:
     """A crop around a jittered box, and alpha about the jittered centre's ray."""
     xyxy = sample.xyxy_px[row]
     sides = np.tile(xyxy[2:] - xyxy[:2], 2)

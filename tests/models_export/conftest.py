@@ -55,6 +55,8 @@ def _toy_sample(rng: np.random.Generator, camera: Camera) -> Sample:
         xyxy_px=np.array(boxes, dtype=np.float64),
         ignore=np.zeros(2, dtype=bool),
         cls=np.zeros(2, np.int64),
+        class_known=np.ones(2, dtype=bool),
+        source="simulated/toy",
         dims_lwh=rng.normal([4.4, 1.8, 1.5], 0.1, (2, 3)),
         alpha=rng.uniform(-np.pi, np.pi, 2),
         visible=np.ones(2),

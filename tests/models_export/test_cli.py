@@ -84,13 +84,17 @@ def test_options_reach_the_run(toy_scenes: Path, tmp_path: Path, runs: Path, mon
 def test_a_pack_goes_from_checkpoints_to_the_service(
     toy_scenes: Path, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("models_export.cli.edge_recipe", small_recipe)
+    # The depth net of the pack takes canvases of one size, smaller than the frames.
+    recipe = small_recipe()
+    fixed = tuple(replace(n, canvas_hw=(128, 224)) if n.name == "depth" else n for n in recipe.networks)
+    monkeypatch.setattr("models_export.cli.edge_recipe", lambda: replace(recipe, networks=fixed))
     run_export(toy_scenes, runs, tmp_path, "--precision", "fp16", "--fp32", "depth", "--batch", "2")
     pack = load_pack(str(tmp_path))
     assert {name: entry.precision for name, entry in pack.manifest.networks.items()} == {
         "detector": "fp16", "multibin": "fp16", "depth": "fp32",
     }  # fmt: skip
     assert pack.networks["detector"].session.get_inputs()[0].shape[0] == 2
+    assert pack.networks["depth"].session.get_inputs()[0].shape == [2, 128, 224, 3]
     scores = json.loads((tmp_path / "manifest.json").read_text())["scores"]
     assert scores["depth"]["parity_with_torch"] < 1e-3
     assert scores["detector"]["parity_with_torch"] < 1e-2

@@ -15,6 +15,8 @@ from models_export.darknet_weights import write_weights
 from models_export.data.augment import NO_AUGMENT
 from models_export.data.samples import Sample
 from models_export.nets.yolov3 import Yolov3, Yolov3Config
+from models_export.paper_detector import yolov3_recipe
+from models_export.recipe import resolved_config
 from models_export.train.checkpoint import load_averaged
 from models_export.train.config import TrainConfig
 from models_export.train.loop import fit
@@ -56,6 +58,8 @@ def frames() -> list[Sample]:
                     xyxy_px=xyxy,
                     ignore=(visible[seen] < 0.5) | ((xyxy[:, 2:] - xyxy[:, :2]).min(1, initial=np.inf) < 6),
                     cls=np.zeros(count, np.int64),
+                    class_known=np.ones(count, dtype=bool),
+                    source="clip",
                     dims_lwh=truth[step].dims_lwh[seen],
                     alpha=np.zeros(count),
                     visible=visible[seen],
@@ -104,7 +108,8 @@ def test_a_run_is_described_and_saved(toy_samples: list[Sample], tmp_path: Path)
     trained = fit(task, config, tmp_path, task.held_out(toy_samples[:2]))
     loaded, state = load_averaged(tmp_path / "detector.pt", Yolov3(task.config))
     assert state["task"]["net"]["anchors_px"] == task.config.anchors_px
-    assert state["task"]["net"]["anchors_px"] != SMALL.anchors_px
+    assert task.config.anchors_px != SMALL.anchors_px
+    assert resolved_config(yolov3_recipe(SMALL), state["task"]["net"]) == task.config
     for ours, theirs in zip(loaded.state_dict().values(), trained.state_dict().values(), strict=True):
         assert torch.equal(ours, theirs)
 
@@ -114,8 +119,10 @@ def test_training_starts_from_a_backbone(toy_samples: list[Sample], tmp_path: Pa
     taught = Yolov3(replace(SMALL, classes=("a", "b")))
     backbone = 1 + sum(1 + 2 * blocks for blocks in SMALL.residuals)
     write_weights(taught, tmp_path / "backbone.weights", convolutions=backbone)
-    net = Yolov3Task(toy_samples, SMALL, start=tmp_path / "backbone.weights").net
+    recipe = yolov3_recipe(SMALL)
+    net = recipe.task(toy_samples, recipe.config).net
     assert isinstance(net, Yolov3)
+    recipe.load_pretrained(net, tmp_path / "backbone.weights")
     pairs = list(zip(net.convolutions, taught.convolutions, strict=True))
     assert all(torch.equal(ours.conv.weight, theirs.conv.weight) for ours, theirs in pairs[:backbone])
     assert not torch.equal(pairs[backbone][0].conv.weight, pairs[backbone][1].conv.weight)

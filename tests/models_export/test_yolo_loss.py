@@ -128,6 +128,13 @@ def test_ignored_vehicles_are_neither_asked_for_nor_blamed() -> None:
     assert losses["total"].item() == 0.0
 
 
+def test_an_unknown_class_is_not_asked_for() -> None:
+    known, unknown = (yolo_loss(heads_of(0.0), TRUTH + torch.tensor([0, cls, 0, 0, 0, 0, 0]), CONFIG) for cls in (0, -1))
+    assert unknown["classes"].item() == 0.0
+    assert known["classes"].item() == pytest.approx(2 * math.log(2))
+    assert unknown["box"].item() == known["box"].item() > 0
+
+
 def test_frames_without_vehicles_ask_for_silence_only() -> None:
     losses = yolo_loss(heads_of(0.0, batch=2), torch.zeros(0, 7), CONFIG)
     assert losses["box"].item() == losses["classes"].item() == 0.0
