@@ -26,7 +26,7 @@ _ANCHOR_DRAWS = 4000
 
 
 class BoxTask:
-    """A detector with its training samples, which may be of several data sets and sizes. A detector's own task adds the loss."""
+    """A detector with its training samples, of several data sets and sizes. A detector's own task adds the loss."""
 
     name = "detector"
 

@@ -59,7 +59,7 @@ def frames() -> list[Sample]:
                     ignore=(visible[seen] < 0.5) | ((xyxy[:, 2:] - xyxy[:, :2]).min(1, initial=np.inf) < 6),
                     cls=np.zeros(count, np.int64),
                     class_known=np.ones(count, dtype=bool),
-                    source="clip",
+                    source="simulated",
                     dims_lwh=truth[step].dims_lwh[seen],
                     alpha=np.zeros(count),
                     visible=visible[seen],
