@@ -21,7 +21,6 @@ from models_export.train.checkpoint import load_averaged
 from models_export.train.config import TrainConfig
 from models_export.train.loop import fit
 from models_export.train.yolov3 import Yolov3Task
-from models_export.yolo_loss import assign_best
 from service.frames import decode
 from service.geometry.boxes import clip_extents, project_extents
 from service.geometry.iou import iou_2d
@@ -37,7 +36,10 @@ STEPS, RATE = 100, 1e-2
 
 @pytest.fixture(scope="module")
 def frames() -> list[Sample]:
-    """The four cameras' simulated frames of two steps, with the vehicles that can be seen in them."""
+    """The four cameras' simulated frames of two steps, with the vehicles that nothing hides.
+
+    Of two vehicles with one cell and one anchor YOLOv3 can only learn one; such pairs hide each other.
+    """
     clip = open_clip(SHIPPED)
     site, truth = parse_site(clip.site), clip_truth(clip)
     samples = []
@@ -56,7 +58,7 @@ def frames() -> list[Sample]:
                     image_size=(image.shape[1], image.shape[0]),
                     camera=scaled,
                     xyxy_px=xyxy,
-                    ignore=(visible[seen] < 0.5) | ((xyxy[:, 2:] - xyxy[:, :2]).min(1, initial=np.inf) < 6),
+                    ignore=(visible[seen] < 0.9) | ((xyxy[:, 2:] - xyxy[:, :2]).min(1, initial=np.inf) < 6),
                     cls=np.zeros(count, np.int64),
                     class_known=np.ones(count, dtype=bool),
                     source="simulated",
@@ -92,12 +94,9 @@ def test_eight_simulated_frames_are_learned_by_heart(frames: list[Sample]) -> No
     with torch.no_grad():
         heads = task.net(batch["images"])
     wanted = batch["targets"][batch["targets"][:, 6] == 0]
-    # Of two vehicles with one cell and one anchor YOLOv3 can only learn one.
-    _, learned = assign_best(wanted, heads, task.config)
-    assert len(learned) >= len(wanted) - 2
     for row in range(len(frames)):
         found = decode_heads([head[row].numpy() for head in heads], spec_of(task.config), 0.5)
-        overlap = iou_2d(found.xyxy_px, learned[learned[:, 0] == row, 2:6].numpy())
+        overlap = iou_2d(found.xyxy_px, wanted[wanted[:, 0] == row, 2:6].numpy())
         assert np.all(overlap.max(0) > 0.9)
         assert np.all(overlap.max(1) > 0.9)
 
