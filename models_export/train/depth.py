@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
@@ -13,6 +14,7 @@ from models_export.data.augment import AugmentConfig, flip_horizontally, photome
 from models_export.data.samples import Sample
 from models_export.losses import depth_loss
 from models_export.nets.depth import DepthConfig, EdgeDepth
+from models_export.nets.dpt import DptConfig, DptHybrid
 from models_export.train.loop import Batch
 
 
@@ -21,11 +23,19 @@ class DepthTask:
 
     name = "depth"
 
-    def __init__(self, samples: list[Sample], config: DepthConfig, augment: AugmentConfig | None = None) -> None:
+    def __init__(
+        self,
+        samples: list[Sample],
+        config: DepthConfig | DptConfig,
+        augment: AugmentConfig | None = None,
+        *,
+        build: Callable[[Any], nn.Module] = EdgeDepth,
+    ) -> None:
+        """build: the depth net of a configuration. The samples' inverse depth is at the stride of ``config``."""
         self.samples = samples
         self.config = config
         self.augment = augment or AugmentConfig()
-        self.net = EdgeDepth(config)
+        self.net = build(config)
 
     def describe(self) -> dict[str, Any]:
         """Configuration of network, data and augmentation."""
@@ -43,6 +53,10 @@ class DepthTask:
             images.append(photometric(image, rng, self.augment))
             targets.append(target)
         return {"images": torch.from_numpy(np.stack(images)), "targets": torch.from_numpy(np.stack(targets))}
+
+    def parameter_groups(self, net: nn.Module) -> list[tuple[list[nn.Parameter], float]]:
+        """Parameters of ``net``, each group with its factor of the learning rate: DPT's encoder learns slower."""
+        return net.parameter_groups() if isinstance(net, DptHybrid) else [(list(net.parameters()), 1.0)]
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
         """Trimmed scale-and-shift-invariant loss plus gradient matching, over cells of known depth."""

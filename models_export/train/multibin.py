@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -13,6 +14,7 @@ from models_export.data.augment import AugmentConfig, photometric
 from models_export.data.samples import Sample
 from models_export.losses import multibin_loss
 from models_export.nets.multibin import EdgeMultibin, MultibinConfig
+from models_export.nets.vgg_multibin import VggMultibinConfig
 from models_export.train.loop import Batch
 from service.geometry.camera import ray_azimuth
 from service.geometry.transforms import Array, wrap_angle
@@ -27,12 +29,20 @@ class MultibinTask:
 
     name = "multibin"
 
-    def __init__(self, samples: list[Sample], config: MultibinConfig, augment: AugmentConfig | None = None) -> None:
+    def __init__(
+        self,
+        samples: list[Sample],
+        config: MultibinConfig | VggMultibinConfig,
+        augment: AugmentConfig | None = None,
+        *,
+        build: Callable[[Any], nn.Module] = EdgeMultibin,
+    ) -> None:
+        """build: the head of a configuration, which gets the samples' mean sizes as its priors."""
         self.samples = samples
         self.vehicles = np.array([(i, j) for i, s in enumerate(samples) for j in np.nonzero(~s.ignore)[0]], dtype=np.int64)
         self.config = replace(config, mean_dims_lwh=mean_dims(samples, len(config.classes)))
         self.augment = augment or AugmentConfig()
-        self.net = EdgeMultibin(self.config)
+        self.net = build(self.config)
 
     def describe(self) -> dict[str, Any]:
         """Configuration of network, data and augmentation."""
@@ -55,6 +65,10 @@ class MultibinTask:
             "alpha": torch.tensor(np.array(alphas), dtype=torch.float32),
             "residuals": torch.tensor(np.array(residuals), dtype=torch.float32),
         }
+
+    def parameter_groups(self, net: nn.Module) -> list[tuple[list[nn.Parameter], float]]:
+        """Parameters of ``net``, each group with its factor of the learning rate: here one group."""
+        return [(list(net.parameters()), 1.0)]
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
         """The paper's equations 2 and 3."""
