@@ -8,6 +8,8 @@ from torch import Tensor, nn
 PIXEL_SCALE, PIXEL_OFFSET = 1.0 / 127.5, 1.0
 """Networks see ``pixel * PIXEL_SCALE - PIXEL_OFFSET``."""
 _PRIOR_OBJECTNESS_LOGIT = -4.6
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""RGB over 0..1: what torchvision's ImageNet weights were trained under."""
 
 
 class Normalise(nn.Module):
@@ -16,6 +18,19 @@ class Normalise(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         """(B, H, W, 3) uint8 to (B, 3, H, W) float."""
         return images.permute(0, 3, 1, 2).float() * PIXEL_SCALE - PIXEL_OFFSET
+
+
+class NormaliseImageNet(nn.Module):
+    """uint8 NHWC RGB pixels, 0..255, to float NCHW of ImageNet's mean 0 and deviation 1."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("mean", 255 * torch.tensor(IMAGENET_MEAN).reshape(1, 3, 1, 1), persistent=False)
+        self.register_buffer("std", 255 * torch.tensor(IMAGENET_STD).reshape(1, 3, 1, 1), persistent=False)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """(B, H, W, 3) uint8 to (B, 3, H, W) float."""
+        return (images.permute(0, 3, 1, 2).float() - self.mean) / self.std
 
 
 def conv(cin: int, cout: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:

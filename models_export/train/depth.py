@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import asdict
 from typing import Any
@@ -15,6 +16,7 @@ from models_export.data.augment import NO_AUGMENT, AugmentConfig, flip_horizonta
 from models_export.data.samples import Sample
 from models_export.losses import depth_loss
 from models_export.nets.depth import DepthConfig, EdgeDepth
+from models_export.nets.dpt import DptConfig, DptHybrid
 from models_export.train.task import Batch, ParameterGroup, decayed_groups, draw_uniform
 
 
@@ -23,11 +25,19 @@ class DepthTask:
 
     name = "depth"
 
-    def __init__(self, samples: list[Sample], config: DepthConfig, augment: AugmentConfig | None = None) -> None:
+    def __init__(
+        self,
+        samples: list[Sample],
+        config: DepthConfig | DptConfig,
+        augment: AugmentConfig | None = None,
+        *,
+        build: Callable[[Any], nn.Module] = EdgeDepth,
+    ) -> None:
+        """build: the depth net of a configuration. The samples' inverse depth is at the stride of ``config``."""
         self.samples = samples
         self.config = config
         self.augment = augment or AugmentConfig()
-        self.net = EdgeDepth(config)
+        self.net = build(config)
 
     def describe(self) -> dict[str, Any]:
         """Configuration of network, data and augmentation."""
@@ -51,7 +61,9 @@ class DepthTask:
         return self.samples[index].labels
 
     def parameter_groups(self, net: nn.Module) -> list[ParameterGroup]:
-        """All of the network at one pace."""
+        """All of the network at one pace; DPT's encoder, which starts from pretrained weights, slower."""
+        if isinstance(net, DptHybrid):
+            return [group for part, rate in net.paces() for group in decayed_groups(part, rate)]
         return decayed_groups(net)
 
     def batch(self, indices: NDArray[np.int64], rng: np.random.Generator) -> Batch:

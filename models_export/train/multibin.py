@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import asdict, replace
 from typing import Any
@@ -17,6 +17,7 @@ from models_export.data.detection import VehicleSample
 from models_export.data.vehicles import Vehicle, vehicles_of
 from models_export.losses import likelihood_loss, multibin_loss
 from models_export.nets.multibin import SIGMA_UNITS, EdgeMultibin, MultibinConfig
+from models_export.nets.vgg_multibin import VggMultibinConfig
 from models_export.train.task import Batch, ParameterGroup, decayed_groups, draw_uniform
 from service.geometry.transforms import Array
 
@@ -29,11 +30,19 @@ class MultibinTask:
 
     name = "multibin"
 
-    def __init__(self, samples: Sequence[VehicleSample], config: MultibinConfig, augment: AugmentConfig | None = None) -> None:
+    def __init__(
+        self,
+        samples: Sequence[VehicleSample],
+        config: MultibinConfig | VggMultibinConfig,
+        augment: AugmentConfig | None = None,
+        *,
+        build: Callable[[Any], nn.Module] = EdgeMultibin,
+    ) -> None:
+        """build: the head of a configuration, which gets the vehicles' mean sizes as its priors."""
         self.vehicles = _vehicles(samples, config)
         self.config = replace(config, mean_dims_lwh=mean_dims(self.vehicles, len(config.classes)))
         self.augment = augment or AugmentConfig()
-        self.net = EdgeMultibin(self.config)
+        self.net = build(self.config)
 
     def describe(self) -> dict[str, Any]:
         """Configuration of network, data and augmentation."""
@@ -78,21 +87,23 @@ class MultibinTask:
         return {"crops": torch.from_numpy(np.stack(crops)), **tensors}
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """The paper's equations 2 and 3, and the likelihood of angle, size and edges."""
-        vectors, confidence, residual, edges, log_sigma = (out.float() for out in net(batch["crops"]))
+        """The paper's equations 2 and 3; of a head that predicts more, also the likelihood of angle, size and edges."""
+        vectors, confidence, residual, *more = (out.float() for out in net(batch["crops"]))
         centers = torch.tensor(self.config.bin_centers_rad, device=vectors.device)
-        alpha = batch["alpha"]
-        paper = multibin_loss(vectors, confidence, residual, alpha, batch["residuals"], centers, self.config.bin_overlap_rad)
-        errors = torch.cat(
-            [angle_error(vectors, alpha, centers)[:, None], residual - batch["residuals"], edges - batch["edges"]], 1
-        )
+        alpha, residuals = batch["alpha"], batch["residuals"]
+        paper = multibin_loss(vectors, confidence, residual, alpha, residuals, centers, self.config.bin_overlap_rad)
+        if not more:
+            return paper
+        edges, log_sigma = more
+        turn = angle_error(vectors, alpha, centers)
+        errors = torch.cat([turn[:, None], residual - residuals, edges - batch["edges"]], 1)
         units = torch.tensor(SIGMA_UNITS, device=errors.device)
         terms = likelihood_loss(errors / units, log_sigma - units.log()).mean(0)
         likelihood = {"angle_nll": terms[0], "size_nll": terms[1:4].mean(), "edge_nll": terms[4:].mean()}
         return {**paper, **likelihood, "total": paper["total"] + torch.stack(list(likelihood.values())).sum()}
 
 
-def _vehicles(samples: Sequence[VehicleSample], config: MultibinConfig) -> list[Vehicle]:
+def _vehicles(samples: Sequence[VehicleSample], config: MultibinConfig | VggMultibinConfig) -> list[Vehicle]:
     return [vehicle for sample in samples for vehicle in vehicles_of(sample, config.max_width)]
 
 

@@ -155,11 +155,15 @@ def decode_multibin(
     """Angles and sizes from raw outputs: bin (cos, sin) pairs (N, B, 2), bin logits (N, B), size residuals (N, 3), metres."""
     rows = np.arange(len(confidence))
     angles = np.arctan2(vectors[..., 1], vectors[..., 0]) + spec.bin_centers_rad
-    best = confidence.argmax(1)
-    ordered = np.sort(confidence.astype(np.float64), axis=1)
+    logits = confidence.astype(np.float64)
+    best = logits.argmax(1)
+    alpha = wrap_angle(angles[rows, best])
+    # The other bin whose centre is nearest to alpha + pi answers for the flip; of two bins it is the other one.
+    from_flip = np.abs(wrap_angle(spec.bin_centers_rad - alpha[:, None] - np.pi))
+    from_flip[rows, best] = np.inf
     return MultibinEstimates(
-        alpha=wrap_angle(angles[rows, best]),
-        flip_log_odds=ordered[:, -1] - ordered[:, -2],
+        alpha=alpha,
+        flip_log_odds=logits[rows, best] - logits[rows, from_flip.argmin(1)],
         dims_lwh=np.maximum(spec.mean_dims_lwh[cls] + residual, 0.3),
     )
 

@@ -18,6 +18,7 @@ from models_export.losses import (
     multibin_loss,
     trimmed_ssi_loss,
 )
+from models_export.nets.vgg_multibin import even_bins
 
 CENTERS = torch.tensor([0.0, math.pi])
 
@@ -107,6 +108,34 @@ def test_beta_one_trains_the_error_like_squares() -> None:
     assert torch.allclose(error.grad, error.detach(), atol=1e-6)
 
 
+def test_multibin_loss_weighs_its_three_terms() -> None:
+    # Size off by 2 m in one of three values: 4/3. Two equal logits: log 2. A vector at right angles: 1.
+    alpha = torch.zeros(1)
+    vectors = torch.tensor([[[0.0, 1.0], [1.0, 0.0]]])
+    off = torch.tensor([[2.0, 0.0, 0.0]])
+    losses = multibin_loss(vectors, torch.zeros(1, 2), off, alpha, torch.zeros(1, 3), CENTERS, 0.1)
+    assert losses["total"].item() == pytest.approx(0.6 * 4 / 3 + math.log(2) + 0.4, abs=1e-6)
+
+
+@given(bins=st.integers(2, 8), first=st.floats(-3, 3), alpha=st.floats(-3.1, 3.1))
+def test_multibin_loss_of_any_number_of_bins_is_zero_at_the_truth_only(bins: int, first: float, alpha: float) -> None:
+    centers = torch.tensor(even_bins(bins, first))
+    truth = torch.tensor([alpha])
+    delta = truth[:, None] - centers[None]
+    nearest = torch.cos(delta).argmax(1)
+    logits = 30.0 * torch.nn.functional.one_hot(nearest, bins).float()
+    sizes = torch.zeros(1, 3)
+
+    def total(turned: float) -> float:
+        vectors = torch.stack([torch.cos(delta + turned), torch.sin(delta + turned)], -1)
+        return multibin_loss(vectors, logits, sizes, truth, sizes, centers, 0.1)["total"].item()
+
+    # At a border both bins are right, and the confidence may count either.
+    if torch.topk(torch.cos(delta), 2).values.diff().abs().item() > 1e-4:
+        assert total(0.0) == pytest.approx(0.0, abs=1e-5)
+        assert total(0.5) == pytest.approx(0.4 * (1 - math.cos(0.5)), abs=1e-5)
+
+
 @given(scale=st.floats(0.1, 10), shift=st.floats(-5, 5), seed=st.integers(0, 100))
 def test_depth_loss_is_zero_up_to_scale_and_shift(scale: float, shift: float, seed: int) -> None:
     target = torch.rand(2, 8, 12, generator=torch.Generator().manual_seed(seed))
@@ -121,6 +150,41 @@ def test_masked_pixels_never_matter() -> None:
     noise = torch.where(mask, torch.zeros(()), 1e3 * torch.rand(2, 8, 12, generator=generator))
     expected = depth_loss(prediction, target, mask)["total"]
     assert torch.allclose(depth_loss(prediction + noise, target - noise, mask)["total"], expected, atol=1e-6)
+
+
+def test_masked_pixels_may_hold_anything_and_learn_nothing() -> None:
+    generator = torch.Generator().manual_seed(2)
+    mask = torch.rand(2, 8, 12, generator=generator) > 0.4
+    prediction = torch.where(mask, torch.rand(2, 8, 12, generator=generator), torch.nan).requires_grad_()
+    target = torch.where(mask, torch.rand(2, 8, 12, generator=generator), torch.inf)
+    total = depth_loss(prediction, target, mask)["total"]
+    total.backward()
+    assert torch.isfinite(total)
+    assert prediction.grad is not None
+    assert torch.all(prediction.grad[~mask] == 0)
+    assert torch.all(torch.isfinite(prediction.grad))
+
+
+@given(seed=st.integers(0, 100), size=st.floats(0.01, 2.0))
+def test_depth_loss_is_least_at_the_truth(seed: int, size: float) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    target, noise = torch.rand(1, 8, 12, generator=generator), torch.randn(1, 8, 12, generator=generator)
+    mask = torch.rand(1, 8, 12, generator=generator) > 0.3
+    spoiled = depth_loss(target + size * noise, target, mask)["total"].item()
+    assert spoiled > depth_loss(target, target, mask)["total"].item() == 0.0
+
+
+def test_trimmed_loss_of_two_exchanged_pixels() -> None:
+    # Median 0, mean deviation 6/5 on both sides: two residuals of 1 / 1.2 among five. Four of five are kept, over 2 x 5.
+    target = torch.tensor([[[-2.0, -1.0, 0.0, 1.0, 2.0]]])
+    prediction = torch.tensor([[[-1.0, -2.0, 0.0, 1.0, 2.0]]])
+    mask = torch.ones_like(target, dtype=torch.bool)
+    assert trimmed_ssi_loss(prediction, target, mask, trim=0.2).item() == pytest.approx(1 / 1.2 / 10, abs=1e-6)
+    assert trimmed_ssi_loss(prediction, target, mask, trim=0.0).item() == pytest.approx(2 / 1.2 / 10, abs=1e-6)
+    # Masked pixels beside them change neither the median nor M.
+    wide = torch.nn.functional.pad(mask, (0, 20))
+    padded = [torch.nn.functional.pad(values, (0, 20)) for values in (prediction, target)]
+    assert trimmed_ssi_loss(*padded, wide, trim=0.2).item() == pytest.approx(1 / 1.2 / 10, abs=1e-6)
 
 
 def test_trimming_really_trims() -> None:
@@ -158,3 +222,18 @@ def test_gradient_loss_sees_an_edge_of_known_height() -> None:
     # Aligned target: median 0, mean deviation 1/2, so the step is 2; one step in each of two rows over 8 pixels.
     flat = torch.zeros_like(target)
     assert gradient_matching_loss(flat, target, mask, scales=1).item() == pytest.approx(2 * 2 / 8, abs=1e-6)
+
+
+def test_gradient_loss_sums_four_resolutions() -> None:
+    # A ramp of 16 columns: median in column 7, mean deviation 4, so a slope of 1/4 a column. Every other column doubles it.
+    target = torch.arange(16.0).expand(1, 16, 16)
+    mask = torch.ones_like(target, dtype=torch.bool)
+    expected = 0.25 * (1 * 15 / 16 + 2 * 7 / 8 + 4 * 3 / 4 + 8 * 1 / 2)
+    assert gradient_matching_loss(torch.zeros_like(target), target, mask).item() == pytest.approx(expected, abs=1e-5)
+
+
+def test_depth_loss_adds_half_the_gradient_term() -> None:
+    generator = torch.Generator().manual_seed(4)
+    prediction, target = torch.rand(1, 8, 12, generator=generator), torch.rand(1, 8, 12, generator=generator)
+    losses = depth_loss(prediction, target, torch.ones_like(target, dtype=torch.bool))
+    assert losses["total"].item() == pytest.approx(losses["ssi"].item() + 0.5 * losses["gradient"].item(), abs=1e-6)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -27,6 +29,17 @@ def test_decoding_inverts_encoding(alpha: float, certainty: float) -> None:
     assert -np.pi <= estimate.alpha[0] < np.pi
     assert estimate.flip_log_odds[0] == pytest.approx(certainty, rel=1e-5)
     np.testing.assert_allclose(estimate.dims_lwh, [[4.5, 1.8, 1.4]], rtol=1e-6)
+
+
+def test_of_many_bins_the_opposite_one_answers_for_the_flip() -> None:
+    spec = replace(SPEC, bin_centers_rad=np.arange(4) * np.pi / 2)
+    alpha = 0.2
+    delta = alpha - spec.bin_centers_rad
+    vectors = np.stack([np.cos(delta), np.sin(delta)], -1)[None].astype(np.float32)
+    confidence = np.array([[5.0, 4.5, -3.0, 1.0]], np.float32)
+    estimate = decode_multibin(vectors, confidence, np.zeros((1, 3), np.float32), np.zeros(1, np.int64), spec)
+    assert estimate.alpha[0] == pytest.approx(alpha, abs=1e-6)
+    assert estimate.flip_log_odds[0] == pytest.approx(8.0)
 
 
 def test_a_crop_is_square_centred_and_keeps_the_shape() -> None:
