@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from models_export.edge import NETWORKS, EdgeRecipe, export, train
+from models_export.guided import GuidedRecipe, export_guided, train_guided
 from service.errors import QuadliftError
 
 train_app = typer.Typer(help="Train the networks of pack `edge` on rendered scenes.", no_args_is_help=True)
@@ -66,6 +67,27 @@ for _name in NETWORKS:
 _add_train_command("all", NETWORKS, "Train all three networks in turn.")
 
 
+@train_app.command("guided")
+def train_guided_command(
+    data: DataOption,
+    pack: Annotated[str, typer.Option(help="Pack whose depth net guides: a shipped one's name, or a folder.")] = "edge",
+    runs: RunsOption = RUNS,
+    steps: StepsOption = None,
+    batch_size: BatchOption = None,
+    device: DeviceOption = "cpu",
+    seed: SeedOption = 1,
+    resume: ResumeOption = False,
+) -> None:
+    """Train the depth-guided detector beside a pack's depth net."""
+    base = GuidedRecipe().training
+    config = replace(base, device=device, seed=seed, steps=steps or base.steps, batch_size=batch_size or base.batch_size)
+    try:
+        train_guided(data, pack, runs, replace(GuidedRecipe(), training=config), resume=resume)
+    except QuadliftError as error:
+        console.print(f"[red]{error}[/red]")
+        raise typer.Exit(1) from None
+
+
 @export_app.command("edge")
 def export_edge(
     data: DataOption,
@@ -83,6 +105,21 @@ def export_edge(
         raise typer.Exit(1) from None
     size = sum((out / entry.file).stat().st_size for entry in manifest.networks.values())
     console.print(f"pack '{manifest.name}' in {out}: {size / 1e6:.1f} MB")
+
+
+@export_app.command("guided")
+def export_guided_command(
+    data: DataOption,
+    pack: Annotated[str, typer.Option(help="Pack to add the detector to: a shipped one's name, or a folder.")] = "edge",
+    runs: RunsOption = RUNS,
+    out: Annotated[Path, typer.Option(help="Folder of the pack with the detector.")] = Path("runs/guided-pack"),
+) -> None:
+    """Export the depth-guided detector, check it against torch, score it, and write the pack with it."""
+    try:
+        export_guided(runs, data, pack, out, GuidedRecipe(), console)
+    except QuadliftError as error:
+        console.print(f"[red]{error}[/red]")
+        raise typer.Exit(1) from None
 
 
 @export_app.callback()

@@ -62,9 +62,10 @@ class Network:
     session: ort.InferenceSession
     metadata: dict[str, Any]
 
-    def run(self, batch: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
-        """All outputs, in the graph's order, for one input batch."""
-        outputs: list[NDArray[np.float32]] = self.session.run(None, {self.session.get_inputs()[0].name: batch})
+    def run(self, *batch: NDArray[Any]) -> list[NDArray[np.float32]]:
+        """All outputs, in the graph's order, for one batch of each input, in the graph's order too."""
+        names = [entry.name for entry in self.session.get_inputs()]
+        outputs: list[NDArray[np.float32]] = self.session.run(None, dict(zip(names, batch, strict=True)))
         return outputs
 
 
