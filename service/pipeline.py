@@ -12,15 +12,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from service.depth_scale import DepthReadings, DepthScales, read_boxes
+from service.depth_scale import DepthReadings, DepthScale, DepthScales, read_boxes
 from service.errors import FrameError
 from service.frames import FrameSet, decode
 from service.fusion import CameraParts, FusedBoxes, FusionSettings, fuse
 from service.geometry.boxes import Boxes, clip_extents, cut_edges
 from service.geometry.camera import Camera, UInt8Image, yaw_from_alpha
+from service.guidance import Guidance, GuidanceSettings, HardMode, View
 from service.lifting import LiftSettings, Measurements, lift
 from service.nets.canvas import canvas_size
-from service.nets.depth import DepthNet
+from service.nets.depth import DepthNet, InverseDepth
 from service.nets.detector import Detections, Detector, edge_sigma
 from service.nets.multibin import Multibin, MultibinEstimates, crop_vehicles
 from service.nets.pack import Pack
@@ -37,6 +38,8 @@ class PipelineSettings:
 
     method: Literal["map", "paper"] = "map"
     """How boxes are lifted and fused: by maximum a posteriori and information, or as in the source paper."""
+    hard_mode: HardMode = "auto"
+    """Whether the depth-guided detector adds to what was lifted: in cameras whose view is hard, in all, or in none."""
     score_threshold: float = 0.3
     """2D detections of a lower score are dropped."""
     nms_iou: float = 0.55
@@ -48,6 +51,7 @@ class PipelineSettings:
     camera alone sees, from far away, often beside their own box from the other cameras. ``per_camera`` has them. The paper's
     method knows no such limit."""
     lift: LiftSettings = field(default_factory=LiftSettings)
+    guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
     fusion: FusionSettings = field(default_factory=FusionSettings)
     paper_fusion: PaperFusionSettings = field(default_factory=PaperFusionSettings)
 
@@ -74,6 +78,8 @@ class SetResult:
     """Cameras whose frame could not be decoded."""
     parts: CameraParts | None = None
     """What each camera contributed to ``boxes``, and when, for the tracker; cameras as in ``camera_ids``."""
+    hard: frozenset[str] = frozenset()
+    """Cameras in which the depth-guided detector ran."""
 
 
 class Pipeline:
@@ -85,6 +91,7 @@ class Pipeline:
         self.detector = Detector(pack.networks["detector"])
         self.multibin = Multibin(pack.networks["multibin"])
         self.depth = DepthNet(pack.networks["depth"])
+        self.guidance = Guidance.of(pack, self.settings.hard_mode, self.settings.guidance)
         self._scales = DepthScales()
         # Whole frame sets run side by side; threads inside OpenCV would only fight them for the same cores.
         cv2.setNumThreads(1)
@@ -110,12 +117,18 @@ class Pipeline:
         with _timed(timing, "orient"):
             estimates = self._orient(images, found)
         with _timed(timing, "depth"):
-            readings = self._read_depth(frame_set, cameras, images, found)
+            maps = self._metric_maps(frame_set, cameras, images)
+            readings = self._read_depth(maps, found)
         with _timed(timing, "lift"):
             measurements = self._measurements(cameras, found, estimates, readings)
-            lifted = self._lift(cameras, frame_set.site, measurements)
+            lifted, index = self._lift(cameras, frame_set.site, measurements), measurements.camera_index
+        hard: frozenset[str] = frozenset()
+        if self.guidance is not None:
+            with _timed(timing, "guided"):
+                views = [View(*row) for row in zip(cameras, images, found, *zip(*maps, strict=True), strict=True)]
+                lifted, index, hard = self._guided(self.guidance, views, frame_set.site, lifted, index)
         with _timed(timing, "fuse"):
-            fused = self._fuse(lifted, measurements.camera_index, cameras)
+            fused = self._fuse(lifted, index, cameras)
             keep = self._reported(fused.boxes)
         timing["total"] = 1e3 * (time.perf_counter() - started)
         return SetResult(
@@ -123,11 +136,12 @@ class Pipeline:
             members=fused.members[keep],
             camera_ids=tuple(camera.id for camera in cameras),
             classes=self.classes,
-            per_camera=[lifted.take(measurements.camera_index == index) for index in range(len(cameras))],
-            detections={camera.id: len(detections) for camera, detections in zip(cameras, found, strict=True)},
+            per_camera=[lifted.take(index == number) for number in range(len(cameras))],
+            detections={camera.id: int((index == number).sum()) for number, camera in enumerate(cameras)},
             timing_ms=timing,
             failed=failed,
             parts=None if fused.parts is None else _timed_parts(fused.parts.of_rows(keep), frame_set, cameras),
+            hard=hard,
         )
 
     def _lift(self, cameras: list[Camera], site: Site, measurements: Measurements) -> Boxes:
@@ -137,6 +151,15 @@ class Pipeline:
 
             return lift_paper(cameras, site.ground, measurements, self.settings.lift)
         return lift(cameras, site.ground, measurements, self.settings.lift)
+
+    def _guided(
+        self, guidance: Guidance, views: list[View], site: Site, lifted: Boxes, index: NDArray[np.int64]
+    ) -> tuple[Boxes, NDArray[np.int64], frozenset[str]]:
+        """Boxes and their cameras after the hard path, and the cameras that took it."""
+        hard = guidance.hard_views(views)
+        own = [site.camera(view.camera.id) for view in views]
+        lifted, index = guidance.add(views, hard, own, site.ground, lifted, index, self.settings.method)
+        return lifted, index, frozenset(view.camera.id for view, is_hard in zip(views, hard, strict=True) if is_hard)
 
     def _fuse(self, lifted: Boxes, camera_index: NDArray[np.int64], cameras: list[Camera]) -> FusedBoxes:
         if self.settings.method == "paper":
@@ -171,13 +194,20 @@ class Pipeline:
         crops = [crop_vehicles(image, detections.xyxy_px, size) for image, detections in zip(images, found, strict=True)]
         return self.multibin.estimate(np.concatenate(crops), np.concatenate([detections.cls for detections in found]))
 
-    def _read_depth(
-        self, frame_set: FrameSet, cameras: list[Camera], images: list[UInt8Image], found: list[Detections]
-    ) -> DepthReadings:
-        parts = []
-        for camera, inverse, detections in zip(cameras, self.depth.infer(images), found, strict=True):
-            scale = self._scales.update(frame_set.site.camera(camera.id), camera, frame_set.site.ground, inverse)
-            parts.append(read_boxes(inverse, scale, detections.xyxy_px, self.depth.reading))
+    def _metric_maps(
+        self, frame_set: FrameSet, cameras: list[Camera], images: list[UInt8Image]
+    ) -> list[tuple[InverseDepth, DepthScale | None]]:
+        """Each image's inverse depth, and what makes it metric."""
+        return [
+            (inverse, self._scales.update(frame_set.site.camera(camera.id), camera, frame_set.site.ground, inverse))
+            for camera, inverse in zip(cameras, self.depth.infer(images), strict=True)
+        ]
+
+    def _read_depth(self, maps: list[tuple[InverseDepth, DepthScale | None]], found: list[Detections]) -> DepthReadings:
+        parts = [
+            read_boxes(inverse, scale, detections.xyxy_px, self.depth.reading)
+            for (inverse, scale), detections in zip(maps, found, strict=True)
+        ]
         return DepthReadings(np.concatenate([p.depth_m for p in parts]), np.concatenate([p.sigma_m for p in parts]))
 
     def _measurements(
