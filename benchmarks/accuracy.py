@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -32,6 +33,7 @@ from benchmarks.scene_sets import SceneSets, open_scene_sets
 from clients.clip import SHIPPED, ClipError
 from models_export.data.pandaset import open_pandaset
 from service.errors import InputError, QuadliftError
+from service.guidance import HardMode
 from service.nets.pack import load_pack
 from service.pipeline import Pipeline, PipelineSettings
 
@@ -129,12 +131,13 @@ def scenes_command(
     pack: PackOption = "edge",
     cameras: Annotated[int | None, typer.Option(min=1, help="Use only the first N; each count if left out.")] = None,
     method: Annotated[Literal["map", "paper"], typer.Option(help="How boxes are lifted and fused.")] = "map",
+    hard_mode: Annotated[HardMode, typer.Option(help="Where the pack's depth-guided detector adds boxes.")] = "auto",
     as_json: JsonOption = False,
     plots: Annotated[Path | None, typer.Option(help="Folder for precision-recall curves and RMSE bars as PNG.")] = None,
 ) -> None:
     """Fused and single-camera boxes on scenes with exact truth: AP, position errors, tracking, by difficulty."""
     with _errors_named():
-        settings = settings_of(method)
+        settings = replace(settings_of(method), hard_mode=hard_mode)
         sets = open_scene_sets(dataset)
         counts = _camera_counts(sets, cameras)
         loaded = load_pack(pack)
@@ -147,10 +150,11 @@ def scenes_command(
     for name, count in sorted(sets.unknown.items()):
         notes.print(f"[yellow]{count} objects of the unknown class '{escape(name)}' skipped.[/yellow]")
     if as_json:
-        about = {"dataset": str(dataset), "scenes": len(sets.scenes), "pack": pack, "method": method, "rules": RULES}
-        typer.echo(json.dumps({**about, "machine": describe_machine(), "difficulties": figures}, indent=1))
+        about = {"dataset": str(dataset), "scenes": len(sets.scenes), "pack": pack, "method": method, "hard_mode": hard_mode}
+        typer.echo(json.dumps({**about, "rules": RULES, "machine": describe_machine(), "difficulties": figures}, indent=1))
         return
-    console.print(accuracy_table(figures, f"{dataset.name}: {len(sets.scenes)} scenes, pack {pack}, method {method}"))
+    title = f"{dataset.name}: {len(sets.scenes)} scenes, pack {pack}, method {method}, hard mode {hard_mode}"
+    console.print(accuracy_table(figures, title))
     for table in (distance_table(figures), tracking_table(figures), paper_table(figures)):
         console.print(table)
 

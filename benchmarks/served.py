@@ -56,7 +56,7 @@ def run_http(url: str, sets: Sequence[FrameSet], seconds: float, clients: int, i
                         return
                     continue
                 with lock:
-                    into.note(1e3 * (time.perf_counter() - begun), message.timing_ms.model_dump())
+                    into.note(1e3 * (time.perf_counter() - begun), message.timing_ms.model_dump(exclude_unset=True))
 
     threads = [threading.Thread(target=client) for _ in range(clients)]
     for thread in threads:

@@ -89,7 +89,7 @@ class _Run:
             captured_at_ns = ns_from_rfc3339(message.captured_at)
             sent_at = self._flying.pop(captured_at_ns, None)
             if sent_at is not None:
-                self._into.note(1e3 * (time.perf_counter() - sent_at), message.timing_ms.model_dump())
+                self._into.note(1e3 * (time.perf_counter() - sent_at), message.timing_ms.model_dump(exclude_unset=True))
             # Messages come in order, so that earlier sets will bring none any more.
             for earlier_ns in [ns for ns in self._flying if ns < captured_at_ns]:
                 del self._flying[earlier_ns]

@@ -13,7 +13,7 @@ from typing import Any
 
 import onnx
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.export import Dim
 
 from service.nets.canvas import ALIGN_PX
@@ -22,7 +22,8 @@ from service.nets.pack import METADATA_KEY, Manifest, NetworkEntry, open_network
 OPSET = 20
 """ONNX operator set of every exported graph; ONNX Runtime runs it since 1.17."""
 _EXAMPLE_BATCH = 2
-_MAX_TILES = 60
+MAX_TILES = 60
+"""Longest side of a dynamic canvas over ``ALIGN_PX``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,13 +44,20 @@ def to_onnx(net: nn.Module, name: str, example_hw: tuple[int, int], outputs: Seq
     example = torch.zeros((_EXAMPLE_BATCH, *example_hw, 3), dtype=torch.uint8)
     shape: dict[int, Any] = {0: Dim("batch")}
     if dynamic_hw:
-        shape |= {1: ALIGN_PX * Dim("rows", min=1, max=_MAX_TILES), 2: ALIGN_PX * Dim("columns", min=1, max=_MAX_TILES)}
+        shape |= {1: ALIGN_PX * Dim("rows", min=1, max=MAX_TILES), 2: ALIGN_PX * Dim("columns", min=1, max=MAX_TILES)}
+    return trace(net, name, {"images": example}, (shape,), outputs)
+
+
+def trace(
+    net: nn.Module, name: str, examples: Mapping[str, Tensor], shapes: Sequence[Mapping[int, Any]], outputs: Sequence[str]
+) -> bytes:
+    """One self-contained ONNX file of a network in eval mode, with the named inputs; ``shapes``: dynamic axes of each."""
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         # The exporter's own deprecations of its internals; nothing of ours.
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
-            net, (example,), dynamo=True, dynamic_shapes=(shape,), input_names=["images"],
+            net, tuple(examples.values()), dynamo=True, dynamic_shapes=tuple(shapes), input_names=list(examples),
             output_names=list(outputs), opset_version=OPSET, verbose=False,
         )  # fmt: skip
     assert program is not None, "the dynamo exporter returns a program"

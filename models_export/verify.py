@@ -31,25 +31,29 @@ class TorchNetwork:
     net: nn.Module
     metadata: dict[str, Any]
 
-    def run(self, batch: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
-        """All outputs for one input batch."""
+    def run(self, *batch: NDArray[Any]) -> list[NDArray[np.float32]]:
+        """All outputs for one batch of each input."""
         with torch.inference_mode():
-            outputs = self.net(torch.from_numpy(batch))
+            outputs = self.net(*(torch.from_numpy(part) for part in batch))
         return [output.numpy() for output in (outputs if isinstance(outputs, tuple) else (outputs,))]
 
 
-def parity(net: nn.Module, network: Network, inputs: Sequence[NDArray[np.uint8]]) -> float:
+Inputs = NDArray[np.uint8] | tuple[NDArray[Any], ...]
+"""A batch of the network's input, or of each of its inputs."""
+
+
+def parity(net: nn.Module, network: Network, inputs: Sequence[Inputs]) -> float:
     """Largest absolute difference between torch and ONNX Runtime, over each output's range, on real inputs.
 
-    inputs: batches (B, H, W, 3) uint8; give several shapes, non-square ones among them.
+    inputs: batches (B, H, W, 3) uint8, or tuples of a batch for each input; give several shapes, non-square ones among them.
     """
     original = TorchNetwork(network.name, net, network.metadata)
-    return max((relative_difference(original.run(batch), network.run(batch), network.name) for batch in inputs), default=0.0)
+    batches = [given if isinstance(given, tuple) else (given,) for given in inputs]
+    differences = [relative_difference(original.run(*batch), network.run(*batch), network.name) for batch in batches]
+    return max(differences, default=0.0)
 
 
-def require_parity(
-    net: nn.Module, network: Network, inputs: Sequence[NDArray[np.uint8]], precision: Precision = "fp32"
-) -> float:
+def require_parity(net: nn.Module, network: Network, inputs: Sequence[Inputs], precision: Precision = "fp32") -> float:
     """:func:`parity`, raising PackError when it exceeds ``MAX_RELATIVE_DIFFERENCE`` of the precision."""
     return require_small(parity(net, network, inputs), network.name, "The exporter changed the network", precision)
 

@@ -6,32 +6,29 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from service.depth_scale import DepthReadings, DepthScales, read_boxes
+from service.depth_scale import DepthReadings, DepthScale, DepthScales, read_boxes
 from service.errors import FrameError
 from service.frames import FrameSet, decode, reduced
 from service.fusion import CameraParts, FusedBoxes, FusionSettings, fuse
-from service.geometry.boxes import Boxes, clip_extents, cut_edges
-from service.geometry.camera import Camera, UInt8Image, yaw_from_alpha
-from service.geometry.transforms import Array
+from service.geometry.boxes import Boxes
+from service.geometry.camera import Camera
+from service.guidance import Guidance, GuidanceSettings, HardMode, View
 from service.lifting import LiftSettings, Measurements, lift
+from service.measuring import Still, cut_detected, measure
 from service.nets.canvas import Canvases, canvas_size
-from service.nets.depth import DepthNet
+from service.nets.depth import DepthNet, InverseDepth
 from service.nets.detections import Detections
-from service.nets.detector import NMS_IOU, SCORE_THRESHOLD, Detector, edge_sigma
-from service.nets.multibin import Crops, Multibin, MultibinEstimates, cut_crops
+from service.nets.detector import NMS_IOU, SCORE_THRESHOLD, Detector
+from service.nets.multibin import Multibin, MultibinEstimates, cut_crops
 from service.nets.pack import Pack
 from service.paper_fusion import PaperFusionSettings, fuse_paper
 from service.site import Site
-
-_UNKNOWN_YAW_SIGMA = np.pi / np.sqrt(3.0)
-"""Standard deviation of an angle that may be any, radians."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +37,8 @@ class PipelineSettings:
 
     method: Literal["map", "paper"] = "map"
     """How boxes are lifted and fused: by maximum a posteriori and information, or as in the source paper."""
+    hard_mode: HardMode = "auto"
+    """Whether the depth-guided detector adds to what was lifted: in cameras whose view is hard, in all, or in none."""
     score_threshold: float = SCORE_THRESHOLD
     """2D detections of a lower score are dropped."""
     nms_iou: float = NMS_IOU
@@ -51,6 +50,7 @@ class PipelineSettings:
     camera alone sees, from far away, often beside their own box from the other cameras. ``per_camera`` has them. The paper's
     method knows no such limit."""
     lift: LiftSettings = field(default_factory=LiftSettings)
+    guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
     fusion: FusionSettings = field(default_factory=FusionSettings)
     paper_fusion: PaperFusionSettings = field(default_factory=PaperFusionSettings)
 
@@ -77,6 +77,8 @@ class SetResult:
     """Cameras whose frame could not be decoded."""
     parts: CameraParts | None = None
     """What each camera contributed to ``boxes``, and when, for the tracker; cameras as in ``camera_ids``."""
+    hard: frozenset[str] = frozenset()
+    """Cameras in which the depth-guided detector ran."""
 
 
 class Pipeline:
@@ -88,6 +90,7 @@ class Pipeline:
         self.detector = Detector(pack.networks["detector"])
         self.multibin = Multibin(pack.networks["multibin"])
         self.depth = DepthNet(pack.networks["depth"])
+        self.guidance = Guidance.of(pack, self.settings.hard_mode, self.settings.guidance)
         self._scales = DepthScales()
         # Whole frame sets run side by side; threads inside OpenCV would only fight them for the same cores.
         cv2.setNumThreads(1)
@@ -107,20 +110,25 @@ class Pipeline:
         timing: dict[str, float] = {}
         started = time.perf_counter()
         with _timed(timing, "decode"):
-            views, failed = self._decode(frame_set)
-        cameras, images = [view.camera for view in views], [view.small for view in views]
+            stills, failed = self._decode(frame_set)
+        cameras = [still.camera for still in stills]
         with _timed(timing, "detect"):
-            canvases = Canvases(images)
+            canvases = Canvases([still.small for still in stills])
             found = self._detect(canvases)
         with _timed(timing, "orient"):
-            estimates = self._orient(views, found)
+            estimates = self._orient(stills, found)
         with _timed(timing, "depth"):
-            readings = self._read_depth(frame_set, views, canvases, found)
+            maps = self._metric_maps(frame_set, stills, canvases)
+            readings = self._read_depth(maps, found)
         with _timed(timing, "lift"):
-            measurements = self._measurements(views, found, estimates, readings)
-            lifted = self._lift(cameras, frame_set.site, measurements)
+            measured = measure(stills, found, estimates, readings, self.detector.spec, self.multibin.spec)
+            lifted, index = self._lift(cameras, frame_set.site, measured), measured.camera_index
+        hard: frozenset[str] = frozenset()
+        if self.guidance is not None:
+            with _timed(timing, "guided"):
+                lifted, index, hard = self._guided(self.guidance, stills, found, maps, frame_set.site, lifted, index)
         with _timed(timing, "fuse"):
-            fused = self._fuse(lifted, measurements.camera_index, cameras)
+            fused = self._fuse(lifted, index, cameras)
             keep = self._reported(fused.boxes)
         timing["total"] = 1e3 * (time.perf_counter() - started)
         return SetResult(
@@ -128,11 +136,12 @@ class Pipeline:
             members=fused.members[keep],
             camera_ids=tuple(camera.id for camera in cameras),
             classes=self.classes,
-            per_camera=[lifted.take(measurements.camera_index == index) for index in range(len(cameras))],
-            detections={camera.id: len(detections) for camera, detections in zip(cameras, found, strict=True)},
+            per_camera=[lifted.take(index == number) for number in range(len(cameras))],
+            detections={camera.id: int((index == number).sum()) for number, camera in enumerate(cameras)},
             timing_ms=timing,
             failed=failed,
             parts=None if fused.parts is None else _timed_parts(fused.parts.of_rows(keep), frame_set, cameras),
+            hard=hard,
         )
 
     def _lift(self, cameras: list[Camera], site: Site, measurements: Measurements) -> Boxes:
@@ -142,6 +151,24 @@ class Pipeline:
 
             return lift_paper(cameras, site.ground, measurements, self.settings.lift)
         return lift(cameras, site.ground, measurements, self.settings.lift)
+
+    def _guided(
+        self,
+        guidance: Guidance,
+        stills: list[Still],
+        found: list[Detections],
+        maps: list[tuple[InverseDepth, DepthScale | None]],
+        site: Site,
+        lifted: Boxes,
+        index: NDArray[np.int64],
+    ) -> tuple[Boxes, NDArray[np.int64], frozenset[str]]:
+        """Boxes and their cameras after the hard path, and the cameras that took it."""
+        rows = zip(stills, found, maps, strict=True)
+        views = [View(still.small_camera, still.small, own, *depth) for still, own, depth in rows]
+        hard = guidance.hard_views(views)
+        cameras = [still.site_camera for still in stills]
+        lifted, index = guidance.add(views, hard, cameras, site.ground, lifted, index, self.settings.method)
+        return lifted, index, frozenset(camera.id for camera, is_hard in zip(cameras, hard, strict=True) if is_hard)
 
     def _fuse(self, lifted: Boxes, camera_index: NDArray[np.int64], cameras: list[Camera]) -> FusedBoxes:
         if self.settings.method == "paper":
@@ -155,8 +182,8 @@ class Pipeline:
         sigma = np.sqrt(boxes.covariance[:, 0, 0] + boxes.covariance[:, 1, 1])
         return confident & (sigma <= self.settings.max_position_sigma_m)
 
-    def _decode(self, frame_set: FrameSet) -> tuple[list[_View], dict[str, FrameError]]:
-        views, failed = [], {}
+    def _decode(self, frame_set: FrameSet) -> tuple[list[Still], dict[str, FrameError]]:
+        stills, failed = [], {}
         small_width = self.detector.spec.max_width
         width = max(self.multibin.spec.max_width or 0, small_width)
         for frame in frame_set.frames:
@@ -166,108 +193,35 @@ class Pipeline:
             except FrameError as error:
                 failed[camera.id] = error
                 continue
-            views.append(_View(camera, image, reduced(image, small_width)))
-        if failed and not views:
+            stills.append(Still(camera, image, reduced(image, small_width)))
+        if failed and not stills:
             raise next(iter(failed.values()))
-        return views, failed
+        return stills, failed
 
     def _detect(self, canvases: Canvases) -> list[Detections]:
         batches, settings = canvases.batches(self.detector.fit), self.settings
         return self.detector.detect_on(batches, score_threshold=settings.score_threshold, nms_iou=settings.nms_iou)
 
-    def _orient(self, views: list[_View], found: list[Detections]) -> MultibinEstimates:
-        size = self.multibin.spec.crop_px
-        crops = [
-            cut_crops(view.image, detections.scaled(view.scale).xyxy_px, size)
-            for view, detections in zip(views, found, strict=True)
-        ]
-        return self.multibin.estimate(Crops.concatenate(crops), np.concatenate([detections.cls for detections in found]))
+    def _orient(self, stills: list[Still], found: list[Detections]) -> MultibinEstimates:
+        crops = cut_detected(stills, found, self.multibin.spec.crop_px)
+        return self.multibin.estimate(crops, np.concatenate([detections.cls for detections in found]))
 
-    def _read_depth(
-        self, frame_set: FrameSet, views: list[_View], canvases: Canvases, found: list[Detections]
-    ) -> DepthReadings:
-        parts = []
+    def _metric_maps(
+        self, frame_set: FrameSet, stills: list[Still], canvases: Canvases
+    ) -> list[tuple[InverseDepth, DepthScale | None]]:
+        """Each image's inverse depth, and what makes it metric."""
         maps = self.depth.infer_on(canvases.batches(self.depth.fit))
-        for view, inverse, detections in zip(views, maps, found, strict=True):
-            scale = self._scales.update(view.own, view.small_camera, frame_set.site.ground, inverse)
-            parts.append(read_boxes(inverse, scale, detections.xyxy_px, self.depth.reading))
+        return [
+            (inverse, self._scales.update(still.site_camera, still.small_camera, frame_set.site.ground, inverse))
+            for still, inverse in zip(stills, maps, strict=True)
+        ]
+
+    def _read_depth(self, maps: list[tuple[InverseDepth, DepthScale | None]], found: list[Detections]) -> DepthReadings:
+        parts = [
+            read_boxes(inverse, scale, detections.xyxy_px, self.depth.reading)
+            for (inverse, scale), detections in zip(maps, found, strict=True)
+        ]
         return DepthReadings(np.concatenate([p.depth_m for p in parts]), np.concatenate([p.sigma_m for p in parts]))
-
-    def _measurements(
-        self, views: list[_View], found: list[Detections], estimates: MultibinEstimates, readings: DepthReadings
-    ) -> Measurements:
-        index = np.repeat(np.arange(len(views)), [len(detections) for detections in found])
-        large = [detections.scaled(view.scale) for view, detections in zip(views, found, strict=True)]
-        seen = np.concatenate([clip_extents(view.camera, d.xyxy_px) for view, d in zip(views, large, strict=True)])
-        cut = np.concatenate([cut_edges(view.camera, seen[index == row]) for row, view in enumerate(views)])
-        score = np.concatenate([d.score for d in found])
-        edges = self._edges(views, index, seen, cut, estimates, score)
-        # A quantised network can give a heading vector of length zero, whose angle is not a number.
-        headed = np.isfinite(estimates.alpha)
-        alpha, yaw = np.where(headed, estimates.alpha, 0.0), np.zeros(len(index))
-        centers = (seen[:, :2] + seen[:, 2:]) / 2
-        for row, view in enumerate(views):
-            own = index == row
-            yaw[own] = yaw_from_alpha(view.camera, alpha[own], centers[own])
-        sigma_yaw, sigma_dims = self.multibin.spec.sigmas(estimates, score, cut.any(1))
-        return Measurements(
-            camera_index=index,
-            xyxy_px=edges[0],
-            sigma_px=edges[1],
-            dims_lwh=estimates.dims_lwh,
-            sigma_dims=sigma_dims,
-            yaw=yaw,
-            sigma_yaw=np.where(headed, sigma_yaw, _UNKNOWN_YAW_SIGMA),
-            flip_log_odds=np.where(headed, estimates.flip_log_odds, 0.0),
-            score=score,
-            cls=np.concatenate([d.cls for d in found]),
-            depth_m=readings.depth_m,
-            sigma_depth_m=readings.sigma_m,
-        )
-
-    def _edges(
-        self,
-        views: list[_View],
-        index: NDArray[np.int64],
-        seen: Array,
-        cut: NDArray[np.bool_],
-        estimates: MultibinEstimates,
-        score: Array,
-    ) -> tuple[Array, Array]:
-        """Edges (N, 4) and their sigmas (N, 4), px: the head's own where it reads any, else the detector's ``seen``.
-
-        An edge that the image border cuts stays at the border, whatever the head makes of it.
-        """
-        if estimates.xyxy_px is None or estimates.sigma is None:
-            scale = np.array([view.scale for view in views]).reshape(-1, 2)[index]
-            small = (seen + 0.5) / np.tile(scale, 2) - 0.5
-            return seen, edge_sigma(self.detector.spec, small, score, cut.any(1)) * np.tile(scale, 2)
-        return np.where(cut, seen, estimates.xyxy_px), estimates.sigma[:, 4:]
-
-
-@dataclass(frozen=True, eq=False)
-class _View:
-    """One camera's decoded frame: as the crops are cut from it, and as the detector and the depth net see it."""
-
-    own: Camera
-    """The site's camera, at the size of its frames."""
-    image: UInt8Image
-    small: UInt8Image
-
-    @cached_property
-    def camera(self) -> Camera:
-        """The camera at the size of ``image``."""
-        return self.own.scaled(self.image.shape[1], self.image.shape[0])
-
-    @cached_property
-    def small_camera(self) -> Camera:
-        """The camera at the size of ``small``."""
-        return self.own.scaled(self.small.shape[1], self.small.shape[0])
-
-    @property
-    def scale(self) -> tuple[float, float]:
-        """Pixels of ``image`` a pixel of ``small``, across and down."""
-        return self.image.shape[1] / self.small.shape[1], self.image.shape[0] / self.small.shape[0]
 
 
 def _timed_parts(parts: CameraParts, frame_set: FrameSet, cameras: list[Camera]) -> CameraParts:

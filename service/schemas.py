@@ -67,6 +67,8 @@ class CameraStatus(_Message):
     """Its capture time minus the set's, milliseconds."""
     detections: int | None = None
     """Vehicles seen in this frame, before fusion."""
+    hard: bool | None = None
+    """Whether the depth-guided detector looked at this frame too; only where the service has one."""
     message: str | None = None
 
 
@@ -78,6 +80,8 @@ class Timing(_Message):
     orient: Finite
     depth: Finite
     lift: Finite
+    guided: Finite | None = None
+    """Only where the service has a depth-guided detector."""
     fuse: Finite
     track: Finite
     total: Finite

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, SecretStr
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -56,6 +56,9 @@ class Settings(BaseSettings):
     """A frame set that has waited this long for a worker is answered 503 instead of being run. Milliseconds."""
     score_threshold: Annotated[float, Field(ge=0, le=1)] | None = None
     """Detections and boxes of a lower score are left out. Unset: the pipeline's own thresholds."""
+    hard_mode: Literal["auto", "always", "never"] = "auto"
+    """Where the pack's depth-guided detector adds boxes: in cameras whose view is dark, of little contrast or crowded, in
+    all, or in none. ``always`` needs a pack that has the network; with one that has not, ``auto`` is ``never``."""
 
     max_body_bytes: Annotated[int, Field(ge=1024)] = 32 * 2**20
     """Bytes of one request's body."""

@@ -39,6 +39,8 @@ class Sample(VehicleSample):
     """(N,) visible fraction."""
     truncated: Array
     """(N,) fraction outside the image."""
+    center: Array
+    """(N, 3) geometric centres in the world, metres."""
     ground: Ground
     """The scene's road."""
     inverse_depth: NDArray[np.float32]
@@ -104,6 +106,7 @@ def _load_sample(
         alpha=wrap_angle(truth.yaw[seen] - ray_azimuth(scaled, (xyxy[:, :2] + xyxy[:, 2:]) / 2)),
         visible=visible,
         truncated=truncated,
+        center=truth.center[seen],
         ground=scene.site.ground,
         inverse_depth=_inverse_depth(scene.depth(camera.id, step), to_canvas(image).shape[:2], image.shape[:2], depth_stride),
         weather=scene.condition,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 
 from fastapi import FastAPI
 
@@ -98,10 +99,9 @@ def default_pipeline(settings: Settings) -> FrameSetRunner:
     from service.nets.pack import load_pack
     from service.pipeline import Pipeline, PipelineSettings
 
-    threshold = settings.score_threshold
-    options = (
-        PipelineSettings() if threshold is None else PipelineSettings(score_threshold=threshold, min_fused_score=threshold)
-    )
+    options = PipelineSettings(hard_mode=settings.hard_mode)
+    if (threshold := settings.score_threshold) is not None:
+        options = replace(options, score_threshold=threshold, min_fused_score=threshold)
     return Pipeline(load_pack(settings.pack, provider=settings.provider), options)
 
 

@@ -143,7 +143,9 @@ def _frame_status(frame_set: FrameSet, frame: EncodedFrame, result: SetResult) -
         return CameraStatus(status="bad", captured_at=captured_at, skew_ms=skew_ms, detections=0, message=failure.message)
     status: Literal["ok", "stale"] = "stale" if frame.camera_id in frame_set.stale else "ok"
     detections = result.detections.get(frame.camera_id, 0)
-    return CameraStatus(status=status, captured_at=captured_at, skew_ms=skew_ms, detections=detections)
+    camera = CameraStatus(status=status, captured_at=captured_at, skew_ms=skew_ms, detections=detections)
+    # Fields that are not set are not sent: clients of services without the hard path see no change.
+    return camera.model_copy(update={"hard": frame.camera_id in result.hard}) if "guided" in result.timing_ms else camera
 
 
 def _times(frame_set: FrameSet, time_ns: int | None) -> tuple[str, float]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -69,23 +70,25 @@ class Network:
     provider: Provider = "cpu"
     """What it computes on."""
 
-    def run(self, batch: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
-        """All outputs, in the graph's order, for one input batch.
+    def run(self, *batch: NDArray[Any]) -> list[NDArray[np.float32]]:
+        """All outputs, in the graph's order, for one batch of each input, in the graph's order too.
 
         A network that was exported for batches of one size gets the batch in parts of it, the last filled up with zeros.
         """
-        size = self.session.get_inputs()[0].shape[0]
-        if not isinstance(size, int) or len(batch) == size:
+        size, count = self.session.get_inputs()[0].shape[0], len(batch[0])
+        if not isinstance(size, int) or count == size:
             return self._run(batch)
         parts = []
-        for start in range(0, len(batch), size):
-            part = np.zeros((size, *batch.shape[1:]), batch.dtype)
-            part[: len(batch) - start] = batch[start : start + size]
-            parts.append(self._run(part))
-        return [np.concatenate(outputs)[: len(batch)] for outputs in zip(*parts, strict=True)]
+        for start in range(0, count, size):
+            filled = [np.zeros((size, *part.shape[1:]), part.dtype) for part in batch]
+            for target, part in zip(filled, batch, strict=True):
+                target[: count - start] = part[start : start + size]
+            parts.append(self._run(filled))
+        return [np.concatenate(outputs)[:count] for outputs in zip(*parts, strict=True)]
 
-    def _run(self, batch: NDArray[np.uint8]) -> list[NDArray[np.float32]]:
-        outputs: list[NDArray[np.float32]] = self.session.run(None, {self.session.get_inputs()[0].name: batch})
+    def _run(self, batch: Sequence[NDArray[Any]]) -> list[NDArray[np.float32]]:
+        names = [entry.name for entry in self.session.get_inputs()]
+        outputs: list[NDArray[np.float32]] = self.session.run(None, dict(zip(names, batch, strict=True)))
         return outputs
 
 

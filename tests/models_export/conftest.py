@@ -61,6 +61,7 @@ def _toy_sample(rng: np.random.Generator, camera: Camera) -> Sample:
         alpha=rng.uniform(-np.pi, np.pi, 2),
         visible=np.ones(2),
         truncated=np.zeros(2),
+        center=rng.uniform([10.0, -4.0, 0.7], [20.0, 4.0, 0.8], (2, 3)),
         ground=GroundPlane(),
         inverse_depth=(0.02 + 0.01 * rows).astype(np.float32),
     )

@@ -1,0 +1,110 @@
+"""From decoded frames and what the networks read in them to the measurements that lifting takes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.depth_scale import DepthReadings
+from service.geometry.boxes import clip_extents, cut_edges
+from service.geometry.camera import Camera, UInt8Image, yaw_from_alpha
+from service.geometry.transforms import Array
+from service.lifting import Measurements
+from service.nets.detections import Detections
+from service.nets.detector import edge_sigma
+from service.nets.detector_spec import DetectorSpec
+from service.nets.multibin import Crops, MultibinEstimates, MultibinSpec, cut_crops
+
+_UNKNOWN_YAW_SIGMA = np.pi / np.sqrt(3.0)
+"""Standard deviation of an angle that may be any, radians."""
+
+
+@dataclass(frozen=True, eq=False)
+class Still:
+    """One camera's decoded frame, at two sizes: crops are cut from the larger, detector and depth net see the smaller."""
+
+    site_camera: Camera
+    """The site's camera, at the size of its frames."""
+    image: UInt8Image
+    """(H, W, 3) RGB."""
+    small: UInt8Image
+    """(h, w, 3) RGB; the same picture, or the same array."""
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The camera at the size of ``image``."""
+        return self.site_camera.scaled(self.image.shape[1], self.image.shape[0])
+
+    @cached_property
+    def small_camera(self) -> Camera:
+        """The camera at the size of ``small``."""
+        return self.site_camera.scaled(self.small.shape[1], self.small.shape[0])
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        """Pixels of ``image`` a pixel of ``small``, across and down."""
+        return self.image.shape[1] / self.small.shape[1], self.image.shape[0] / self.small.shape[0]
+
+
+def cut_detected(stills: Sequence[Still], found: Sequence[Detections], crop_px: int) -> Crops:
+    """Crops of all detections (in px of ``small``), a still after the other."""
+    pairs = zip(stills, found, strict=True)
+    return Crops.concatenate([cut_crops(still.image, own.scaled(still.scale).xyxy_px, crop_px) for still, own in pairs])
+
+
+def measure(
+    stills: Sequence[Still],
+    found: Sequence[Detections],
+    estimates: MultibinEstimates,
+    readings: DepthReadings,
+    detector: DetectorSpec,
+    multibin: MultibinSpec,
+) -> Measurements:
+    """What the networks say of all detections, in px of ``image``, each reading with its standard deviation."""
+    index = np.repeat(np.arange(len(stills)), [len(own) for own in found])
+    large = [own.scaled(still.scale).xyxy_px for still, own in zip(stills, found, strict=True)]
+    seen = np.concatenate([clip_extents(still.camera, xyxy) for still, xyxy in zip(stills, large, strict=True)])
+    cut = np.concatenate([cut_edges(still.camera, seen[index == row]) for row, still in enumerate(stills)])
+    score = np.concatenate([own.score for own in found])
+    scale = np.tile(np.array([still.scale for still in stills]).reshape(-1, 2), 2)[index]
+    xyxy, sigma_px = _edges(seen, cut, score, scale, estimates, detector)
+    # A quantised network can give a heading vector of length zero, whose angle is not a number.
+    headed = np.isfinite(estimates.alpha)
+    alpha, yaw = np.where(headed, estimates.alpha, 0.0), np.zeros(len(index))
+    centers = (seen[:, :2] + seen[:, 2:]) / 2
+    for row, still in enumerate(stills):
+        own_rows = index == row
+        yaw[own_rows] = yaw_from_alpha(still.camera, alpha[own_rows], centers[own_rows])
+    sigma_yaw, sigma_dims = multibin.sigmas(estimates, score, cut.any(1))
+    return Measurements(
+        camera_index=index,
+        xyxy_px=xyxy,
+        sigma_px=sigma_px,
+        dims_lwh=estimates.dims_lwh,
+        sigma_dims=sigma_dims,
+        yaw=yaw,
+        sigma_yaw=np.where(headed, sigma_yaw, _UNKNOWN_YAW_SIGMA),
+        flip_log_odds=np.where(headed, estimates.flip_log_odds, 0.0),
+        score=score,
+        cls=np.concatenate([own.cls for own in found]),
+        depth_m=readings.depth_m,
+        sigma_depth_m=readings.sigma_m,
+    )
+
+
+def _edges(
+    seen: Array, cut: NDArray[np.bool_], score: Array, scale: Array, estimates: MultibinEstimates, detector: DetectorSpec
+) -> tuple[Array, Array]:
+    """Edges (N, 4) and their standard deviations (N, 4), px: the head's own where it reads any, else the detector's ``seen``.
+
+    scale: (N, 4) pixels of the large image a pixel that the detector saw. An edge that the image border cuts stays at the
+    border, whatever the head makes of it.
+    """
+    if estimates.xyxy_px is None or estimates.sigma is None:
+        small = (seen + 0.5) / scale - 0.5
+        return seen, edge_sigma(detector, small, score, cut.any(1)) * scale
+    return np.where(cut, seen, estimates.xyxy_px), estimates.sigma[:, 4:]
