@@ -22,10 +22,10 @@ from models_export.guided_losses import GuidedLossConfig
 from models_export.guided_scores import measure
 from models_export.nets.blocks import parameter_count
 from models_export.nets.guided import OUTPUTS, EdgeGuided, GuidedConfig
-from models_export.train.guided import GuidedTask
-from models_export.train.guided_targets import AssignConfig
 from models_export.train.checkpoint import load_averaged, read_checkpoint
 from models_export.train.config import TrainConfig
+from models_export.train.guided import GuidedTask
+from models_export.train.guided_targets import AssignConfig
 from models_export.train.loop import fit
 from models_export.verify import require_parity
 from service.nets.canvas import ALIGN_PX

@@ -80,14 +80,17 @@ def _wrapped(request: ImportRequest, base: Pack) -> tuple[Exported, dict[str, fl
     ids = class_ids(request.classes, base.manifest.classes, request.class_map)
     graph = read_graph(request.model, request.size)
     normalisation, fit = _input(request, graph.size)
-    canvas = fit.batches([drawn_image() if request.image is None else request.image])[0].pixels
+    image = drawn_image() if request.image is None else request.image
+    canvases = fit.batches([image, np.ascontiguousarray(image[::-1])])[0].pixels
+    pixels = normalisation.apply(canvases)
     original = _Original(request.model, graph)
-    reading, expected = _read(request, graph, original, normalisation.apply(canvas))
+    reading = _read(request, graph, original, pixels[:1])
     metadata = _metadata(request, base, ids, fit, reading)
-    two = normalisation.apply(np.concatenate([canvas, canvas]))
-    batched = graph.is_batched and original.keeps_batches(two, reading.outputs)
+    batched = graph.is_batched and original.keeps_batches(pixels, reading.outputs)
     model = with_metadata(wrap(graph, normalisation, reading.outputs, batched=batched), metadata)
-    difference = relative_difference(expected, open_network("detector", model).run(canvas), "detector")
+    checked = len(canvases) if batched else 1
+    expected = original.run(pixels[:checked], reading.outputs)
+    difference = relative_difference(expected, open_network("detector", model).run(canvases[:checked]), "detector")
     require_small(difference, "detector", "The wrapping changed the network")
     scores = {"parity_with_original": float(f"{difference:.2e}")}
     return Exported("detector", model, graph.precision, graph.parameters), scores, _origin(request, normalisation)
@@ -139,10 +142,8 @@ class _Original:
             return False
 
 
-def _read(
-    request: ImportRequest, graph: ForeignGraph, original: _Original, pixels: NDArray[np.float32]
-) -> tuple[Reading, list[NDArray[Any]]]:
-    """What the outputs are, and their values in the order of the reading."""
+def _read(request: ImportRequest, graph: ForeignGraph, original: _Original, pixels: NDArray[np.float32]) -> Reading:
+    """What the outputs are, told from those for one picture."""
     values = dict(zip(original.names, original.run(pixels, original.names), strict=True))
     question = Question(
         outputs=[Output(name, output[0]) for name, output in values.items() if output.ndim and len(output) == 1],
@@ -156,8 +157,7 @@ def _read(
     if len(question.outputs) != len(values):
         shapes = ", ".join(f"{name} {output.shape}" for name, output in values.items())
         raise InputError(f"outputs for one image are {shapes}.", field="outputs", remedy="All must begin with the batch.")
-    reading = read_outputs(request.format, question)
-    return reading, [values[name] for name in reading.outputs]
+    return read_outputs(request.format, question)
 
 
 def _input(request: ImportRequest, size: tuple[int, int]) -> tuple[Normalisation, InputFit]:

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from service.errors import PackError
 from service.geometry.transforms import Array, wrap_angle
 from service.nets.canvas import PADDED, canvas_size
-from service.nets.depth import InverseDepth
 from service.nets.decoding import MAX_CANDIDATES
+from service.nets.depth import InverseDepth
 from service.nets.pack import Network
 
 MAX_INVERSE_DEPTH = 0.5

@@ -26,6 +26,7 @@ def ramp(width: int, height: int, steps: int = 1) -> np.ndarray:
     return image
 
 
+@settings(deadline=None)
 @given(fit=FITS, width=SIDES, height=SIDES, seed=st.integers(0, 99))
 def test_points_and_boxes_come_back(fit: InputFit, width: int, height: int, seed: int) -> None:
     placement = fit.placement(width, height)
@@ -100,6 +101,7 @@ def test_canvases_are_made_once_a_fit() -> None:
     assert canvases.batches(InputFit((32, 32)))[0].pixels.shape == (1, 32, 32, 3)
 
 
+@settings(deadline=None)
 @given(fit=FITS)
 def test_metadata_comes_back(fit: InputFit) -> None:
     read = InputFit.from_metadata(fit.to_metadata())
