@@ -11,10 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import onnx
 import torch
-from numpy.typing import NDArray
 from torch import nn
 from torch.export import Dim
 
@@ -118,11 +116,6 @@ def write_pack(
     )
     (out / "manifest.json").write_text(json.dumps(manifest.model_dump(), indent=1) + "\n", encoding="utf-8")
     return manifest
-
-
-def canvases_of(images: Sequence[NDArray[np.uint8]], batch: int = 4) -> list[NDArray[np.uint8]]:
-    """Equal-sized canvases in batches, for calibration."""
-    return [np.stack(images[i : i + batch]) for i in range(0, len(images) - batch + 1, batch)]
 
 
 def _strip_source_paths(model: onnx.ModelProto) -> None:

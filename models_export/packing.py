@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from rich.console import Console
 
 from models_export.data.dataset import list_scenes
 from models_export.data.samples import Sample, split_scenes
-from models_export.export import Exported, canvases_of, fixed_batch, to_onnx, with_metadata, write_pack
+from models_export.export import Exported, fixed_batch, to_onnx, with_metadata, write_pack
 from models_export.half import to_half
 from models_export.metadata import UNMEASURED
 from models_export.nets.blocks import parameter_count
@@ -32,13 +32,14 @@ from models_export.validate import (
     multibin_scores,
 )
 from models_export.verify import require_parity
-from service.nets.canvas import to_canvas
+from service.nets.canvas import PADDED, InputFit
 from service.nets.depth import DepthNet
-from service.nets.detector import Detections, Detector
+from service.nets.detections import Detections
+from service.nets.detector import Detector
 from service.nets.multibin import Multibin, crop_vehicles
 from service.nets.pack import Manifest, Network, open_network
 
-_CALIBRATION_SCENES, _CALIBRATION_IMAGES = 24, 96
+_CALIBRATION_SCENES, _CALIBRATION_IMAGES, _CALIBRATION_BATCH = 24, 96, 4
 _PARITY_IMAGES, _CROPS = 4, 32
 _EXAMPLE_HEIGHT = 192
 
@@ -127,7 +128,7 @@ class _Job:
 
     def detector(self) -> list[Detections]:
         """The detector, and what it finds on the validation frames."""
-        draft = self._draft("detector", _image_batches(self.samples), self._calibration_canvases())
+        draft = self._frame_draft("detector")
         found = detect_all(Detector(draft.open()), self.samples)
         measured = {"sigma_edge_px": edge_errors(match_all(found, self.samples)).to_metadata()}
         self._finish(draft, measured, detector_scores(found, self.samples) | measured)
@@ -142,9 +143,15 @@ class _Job:
 
     def depth(self, found: list[Detections]) -> None:
         """The depth net, measured in detected boxes."""
-        draft = self._draft("depth", _image_batches(self.samples), self._calibration_canvases())
+        draft = self._frame_draft("depth")
         scores = depth_scores(DepthNet(draft.open()), self.samples, match_all(found, self.samples))
         self._finish(draft, {key: scores[key] for key in UNMEASURED["depth"]}, scores)
+
+    def _frame_draft(self, name: str) -> _Draft:
+        """The draft of a network that sees whole frames."""
+        fit = _fit(self.recipe.network(name))
+        draft = self._draft(name, _image_batches(self.samples, fit), self._calibration_canvases(fit))
+        return replace(draft, metadata=draft.metadata | {"fit": fit.to_metadata()})
 
     def _draft(self, name: str, inputs: list[Images], calibration: list[Images]) -> _Draft:
         """Checkpoint to ONNX at the asked precision and batch; each form that can be is compared with torch on ``inputs``."""
@@ -172,15 +179,21 @@ class _Job:
         self.exported.append(Exported(draft.name, model, draft.precision, draft.parameters))
         self.scores[draft.name] |= scores
 
-    def _calibration_canvases(self) -> list[Images]:
-        return canvases_of([sample.canvas for sample in self.calibration])
+    def _calibration_canvases(self, fit: InputFit) -> list[Images]:
+        groups = [batch.pixels for batch in fit.batches([image_of(sample) for sample in self.calibration])]
+        return [group[i : i + _CALIBRATION_BATCH] for group in groups for i in range(0, len(group), _CALIBRATION_BATCH)]
 
 
-def _image_batches(samples: list[Sample]) -> list[Images]:
+def _fit(network: NetworkRecipe) -> InputFit:
+    """How frames become canvases of a network that sees whole frames."""
+    return PADDED if network.canvas_hw is None else InputFit((network.canvas_hw[1], network.canvas_hw[0]))
+
+
+def _image_batches(samples: list[Sample], fit: InputFit) -> list[Images]:
     """Real frames in two non-square shapes: as they are, and a part of them."""
     images = [image_of(sample) for sample in samples[:_PARITY_IMAGES]]
-    cut = [to_canvas(np.ascontiguousarray(image[: image.shape[0] * 2 // 3, : image.shape[1] // 2])) for image in images]
-    return [np.stack([to_canvas(image) for image in images]), np.stack(cut)]
+    cut = [np.ascontiguousarray(image[: image.shape[0] * 2 // 3, : image.shape[1] // 2]) for image in images]
+    return [batch.pixels for batch in [*fit.batches(images), *fit.batches(cut)]]
 
 
 def _crop_batches(samples: list[Sample], side: int) -> list[Images]:

@@ -68,7 +68,7 @@ class NetworkRecipe:
     metadata: Callable[[Any], dict[str, Any]]
     """Of the ONNX file, from the resolved configuration; what validation measures is added."""
     canvas_hw: tuple[int, int] | None = None
-    """Height and width of the only input that it takes, px; None: any multiple of 32 px."""
+    """Height and width of the only input that it takes, px: frames are scaled to fit. None: any multiple of 32 px."""
     precision: Precision = "fp32"
     """In which it is exported unless asked otherwise."""
     load_pretrained: Callable[[Any, Path], None] = load_checkpoint
