@@ -17,7 +17,7 @@ from models_export.export import Exported, to_onnx, with_metadata
 from models_export.foreign.formats import read_anchors
 from models_export.foreign.names import class_ids, read_class_map, read_classes
 from models_export.import_detector import UNKNOWN_LICENCE, drawn_image
-from models_export.metadata import detector_metadata
+from models_export.metadata import yolov3_metadata
 from models_export.nets.blocks import parameter_count
 from models_export.nets.yolov3 import Yolov3, Yolov3Config, tiny_config
 from models_export.verify import require_parity
@@ -68,11 +68,6 @@ def import_darknet(
         origin={"origin": weights.name, "images_seen": seen, "classes": list(config.classes)},
         scores={"parity_with_torch": float(f"{difference:.2e}")},
     )
-
-
-def yolov3_metadata(config: Yolov3Config) -> dict[str, Any]:
-    """What the service needs to know to decode the network's heads as Darknet does, its errors aside."""
-    return {**detector_metadata(config), "format": "yolov3"}
 
 
 def config_of(metadata: Mapping[str, Any]) -> Yolov3Config:

@@ -23,7 +23,7 @@ from service.errors import InputError
 from service.nets.canvas import InputFit
 from service.nets.detector_spec import DetectorSpec, Format
 from service.nets.error_model import ErrorModel
-from service.nets.pack import Manifest, open_network, session_options
+from service.nets.pack import Manifest, Pack, open_network, session_options
 
 UNKNOWN_LICENCE = "unknown: as the model's author says"
 _TEST_IMAGE_SIZE = (640, 360)
@@ -71,12 +71,30 @@ def import_detector(request: ImportRequest) -> Manifest:
     wrapping that changes the outputs.
     """
     base = open_base(request.base, request.out)
+    detector, scores, origin = _wrapped(request, base)
+    return write_detector_pack(request.out, base, detector, licence=request.licence, origin=origin, scores=scores)
+
+
+def _wrapped(request: ImportRequest, base: Pack) -> tuple[Exported, dict[str, float], dict[str, Any]]:
+    """The wrapped and checked detector, its scores, and where it comes from."""
     ids = class_ids(request.classes, base.manifest.classes, request.class_map)
     graph = read_graph(request.model, request.size)
     normalisation, fit = _input(request, graph.size)
     canvas = fit.batches([drawn_image() if request.image is None else request.image])[0].pixels
     original = _Original(request.model, graph)
     reading, expected = _read(request, graph, original, normalisation.apply(canvas))
+    metadata = _metadata(request, base, ids, fit, reading)
+    two = normalisation.apply(np.concatenate([canvas, canvas]))
+    batched = graph.is_batched and original.keeps_batches(two, reading.outputs)
+    model = with_metadata(wrap(graph, normalisation, reading.outputs, batched=batched), metadata)
+    difference = relative_difference(expected, open_network("detector", model).run(canvas), "detector")
+    require_small(difference, "detector", "The wrapping changed the network")
+    scores = {"parity_with_original": float(f"{difference:.2e}")}
+    return Exported("detector", model, graph.precision, graph.parameters), scores, _origin(request, normalisation)
+
+
+def _metadata(request: ImportRequest, base: Pack, ids: Mapping[int, str], fit: InputFit, reading: Reading) -> dict[str, Any]:
+    """The detector's metadata, as the service's own reader accepts it."""
     base_spec = DetectorSpec.from_metadata(base.networks["detector"].metadata)
     metadata = {
         "format": request.format,
@@ -89,21 +107,7 @@ def import_detector(request: ImportRequest) -> Manifest:
         **reading.metadata,
     }
     DetectorSpec.from_metadata(metadata)
-    batched = graph.is_batched and original.keeps_batches(
-        normalisation.apply(np.concatenate([canvas, canvas])), reading.outputs
-    )
-    model = with_metadata(wrap(graph, normalisation, reading.outputs, batched=batched), metadata)
-    difference = relative_difference(expected, open_network("detector", model).run(canvas), "detector")
-    require_small(difference, "detector", "The wrapping changed the network")
-    detector = Exported("detector", model, graph.precision, graph.parameters)
-    return write_detector_pack(
-        request.out,
-        base,
-        detector,
-        licence=request.licence,
-        origin=_origin(request, normalisation),
-        scores={"parity_with_original": float(f"{difference:.2e}")},
-    )
+    return metadata
 
 
 class _Original:

@@ -25,6 +25,11 @@ def detector_metadata(config: Any) -> dict[str, Any]:
     }
 
 
+def yolov3_metadata(config: Any) -> dict[str, Any]:
+    """The same of a YOLOv3, whose heads are decoded as Darknet does."""
+    return {**detector_metadata(config), "format": "yolov3"}
+
+
 def multibin_metadata(config: Any) -> dict[str, Any]:
     """Of a multi-bin head: its crops, bins and mean sizes."""
     return {

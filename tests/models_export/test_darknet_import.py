@@ -15,10 +15,11 @@ from benchmarks.drive_score import score_drive
 from benchmarks.drive_torch import score_darknet
 from benchmarks.drive_truth import drive_frames
 from benchmarks.recordings import PANDASET_CLIP, recording
-from models_export.darknet_import import app, config_of, import_darknet, yolov3_metadata
+from models_export.darknet_import import app, config_of, import_darknet
 from models_export.darknet_weights import write_weights
 from models_export.data.pandaset import open_pandaset
 from models_export.foreign.names import COCO_CLASSES
+from models_export.metadata import yolov3_metadata
 from models_export.nets.yolov3 import Yolov3, Yolov3Config, tiny_config
 from service.errors import NotFoundError
 from service.nets.detector import Detector

@@ -19,7 +19,7 @@ from models_export.nets.multibin import MultibinConfig
 from models_export.train.checkpoint import load_averaged, read_checkpoint
 from models_export.train.config import Optimizer, TrainConfig
 from models_export.train.depth import DepthTask
-from models_export.train.detector import DetectorTask, anchors_of
+from models_export.train.detector import DetectorTask
 from models_export.train.loop import fit
 from models_export.train.multibin import MultibinTask
 from models_export.train.task import decayed_groups
@@ -95,14 +95,6 @@ def test_a_checkpoint_holds_its_configuration(toy_samples: list[Sample], tmp_pat
 def test_a_missing_checkpoint_says_so(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="Train the network first"):
         load_averaged(tmp_path / "none.pt", torch.nn.Identity())
-
-
-def test_anchors_span_the_boxes(toy_samples: list[Sample]) -> None:
-    anchors = np.array(anchors_of(toy_samples, (8, 16, 32)))
-    sides = np.concatenate([s.xyxy_px[:, 2:] - s.xyxy_px[:, :2] for s in toy_samples])
-    assert anchors.shape == (3, 3, 2)
-    assert np.all(anchors.reshape(-1, 2).min(0) >= sides.min(0) - 0.1)
-    assert np.all(anchors.reshape(-1, 2).max(0) <= sides.max(0) + 0.1)
 
 
 def with_weather(samples: list[Sample]) -> list[Sample]:

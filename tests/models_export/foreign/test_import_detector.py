@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
+from onnx import numpy_helper
 from typer.testing import CliRunner
 
 from benchmarks import clip_score
@@ -87,9 +89,6 @@ def test_the_pipeline_runs_an_imported_pack(write_model: Any, tmp_path: Path) ->
 
 
 def test_a_batch_that_is_only_declared_is_not_believed(write_model: Any, tmp_path: Path) -> None:
-    import onnx
-    from onnx import numpy_helper
-
     path = write_model("v8", "batch")
     model = onnx.load(path)
     for tensor in model.graph.initializer:
@@ -102,6 +101,17 @@ def test_a_batch_that_is_only_declared_is_not_believed(write_model: Any, tmp_pat
     detector = Detector(load_pack(str(tmp_path / "pack")).networks["detector"])
     assert detector.network.session.get_inputs()[0].shape[0] == 1
     assert len(detector.detect([picture()] * 3)) == 3
+
+
+def test_a_model_of_half_precision_gets_halves(write_model: Any, tmp_path: Path) -> None:
+    path = write_model("v8")
+    model = onnx.load(path)
+    image = model.graph.input[0]
+    image.name, image.type.tensor_type.elem_type = "halves", onnx.TensorProto.FLOAT16
+    model.graph.node.insert(0, onnx.helper.make_node("Cast", ["halves"], ["images"], to=onnx.TensorProto.FLOAT))
+    onnx.save(model, path)
+    import_detector(request(path, "v8", tmp_path / "pack"))
+    assert len(Detector(load_pack(str(tmp_path / "pack")).networks["detector"]).detect([picture()])[0]) > 0
 
 
 def test_a_wrapping_that_changes_the_outputs_is_refused(
