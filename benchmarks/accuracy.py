@@ -20,7 +20,9 @@ from rich.table import Table
 from benchmarks.clip_score import score_clip, score_roadside
 from benchmarks.drive import RULES as DRIVE_RULES
 from benchmarks.drive import drive_figures, drive_table, score_pack, write_pictures
+from benchmarks.drive_centres import score_single_cameras
 from benchmarks.drive_truth import drive_frames
+from benchmarks.flat_score import carla_results, contenders, drive_results, flat_curve, flat_summary
 from benchmarks.kitti_folders import read_ids, read_pair
 from benchmarks.kitti_protocol import CLASSES, DEFAULT_OVERLAPS, as_percent, evaluate
 from benchmarks.kitti_report import kitti_notes, kitti_table
@@ -31,7 +33,9 @@ from benchmarks.scene_report import accuracy_table, distance_table, paper_table,
 from benchmarks.scene_score import RULES, score_scenes, settings_of, summaries
 from benchmarks.scene_sets import SceneSets, open_scene_sets
 from clients.clip import SHIPPED, ClipError
+from models_export.data.carla2d import ARCHIVE as CARLA_FRAMES
 from models_export.data.pandaset import open_pandaset
+from models_export.data.pandaset_samples import HELD_OUT_STEPS
 from service.errors import InputError, QuadliftError
 from service.guidance import HardMode
 from service.nets.pack import load_pack
@@ -64,6 +68,33 @@ def roadside_command(pack: PackOption = "edge", as_json: JsonOption = False) -> 
     _report("roadside", pack, lambda pipeline: score_roadside(pipeline, open_roadside_clip()), as_json)
 
 
+@app.command("carla2d")
+def carla2d_command(pack: PackOption = "edge", as_json: JsonOption = False) -> None:
+    """The 2D detector on held-out frames of a driving CARLA camera: AP at IoU 0.5 (needs the recording)."""
+    with _errors_named():
+        archive = recording(CARLA_FRAMES)
+        found = contenders(load_pack(pack), archive.parent)
+        results = {c.name: flat_summary(flat_curve(carla_results(c, archive))) for c in found}
+    _print_figures("carla2d", pack, results, as_json)
+
+
+@app.command("pandaset-held-out")
+def pandaset_held_out_command(
+    pack: PackOption = "edge",
+    every: Annotated[int, typer.Option(min=1, help="Score every n-th held-out step.")] = 3,
+    as_json: JsonOption = False,
+) -> None:
+    """The end of a real drive that no training sees: AP of 2D boxes, and where one camera alone puts vehicles (needs it)."""
+    with _errors_named():
+        archive, loaded = recording(PANDASET_CLIP), load_pack(pack)
+        found = contenders(loaded, archive.parent)
+        results: dict[str, Any] = {c.name: flat_summary(flat_curve(drive_results(c, archive, every))) for c in found}
+        pipeline = Pipeline(loaded, PipelineSettings())
+        centres = score_single_cameras(pipeline, open_pandaset(archive), HELD_OUT_STEPS[::every])
+    results["3d_one_camera_within_40_m"] = centres.summary()
+    _print_figures("pandaset-held-out", pack, results, as_json)
+
+
 @app.command("pandaset")
 def pandaset_command(
     pack: PackOption = "edge",
@@ -79,7 +110,8 @@ def pandaset_command(
     """The 2D detector on six real cameras of a moving car: recall and false boxes at IoU 0.5 (needs the recording)."""
     thresholds = scores or [0.1, 0.3, 0.5]
     with _errors_named():
-        frames = list(drive_frames(open_pandaset(recording_path or recording(PANDASET_CLIP)), every))
+        drive = open_pandaset(recording_path or recording(PANDASET_CLIP))
+        frames = list(drive_frames(drive, range(0, drive.steps, every)))
         network = load_pack(pack).networks["detector"]
         found = {"ONNX Runtime": score_pack(network, frames, thresholds)}
         difference = None
@@ -181,6 +213,10 @@ def _errors_named() -> Iterator[None]:
 def _report(name: str, pack: str, score: Any, as_json: bool) -> None:
     with _errors_named():
         result = score(Pipeline(load_pack(pack), PipelineSettings()))
+    _print_figures(name, pack, result, as_json)
+
+
+def _print_figures(name: str, pack: str, result: dict[str, Any], as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps({name: result, "pack": pack, "machine": describe_machine()}, indent=1))
         return

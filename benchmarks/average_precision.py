@@ -59,7 +59,7 @@ def precision_recall(found: Sequence[Found], wanted: Sequence[Wanted], metric: s
     result = np.concatenate([np.zeros(0, np.int64), *outcomes])
     score = np.concatenate([np.zeros(0), *(f.score for f in found)])
     counted = int(sum(w.counted.sum() for w in wanted))
-    return _curve(result, score, counted)
+    return curve(result, score, counted)
 
 
 def outcome(found: Found, wanted: Wanted, overlap: Array, min_overlap: float) -> NDArray[np.int64]:
@@ -75,7 +75,8 @@ def outcome(found: Found, wanted: Wanted, overlap: Array, min_overlap: float) ->
     return result
 
 
-def _curve(result: NDArray[np.int64], score: Array, counted: int) -> PrecisionRecall:
+def curve(result: NDArray[np.int64], score: Array, counted: int) -> PrecisionRecall:
+    """The curve of boxes (K,): 1 right, 0 false, -1 left out, with their scores (K,), against ``counted`` vehicles."""
     used = result != _LEFT_OUT
     order = np.argsort(-score[used], kind="stable")
     ordered, right = score[used][order], result[used][order] == _RIGHT

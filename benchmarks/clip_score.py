@@ -20,6 +20,7 @@ from service.site import Site
 ROADSIDE_IOU = 0.4
 ROADSIDE_RANGE_M = 40.0
 ROADSIDE_MATCH_M = 1.5
+ROADSIDE_3D_CLASSES = ("CAR", "VAN")
 
 
 def score_clip(pipeline: Pipeline, clip_path: Path = SHIPPED, cameras: int | None = None) -> dict[str, float | int]:
@@ -40,7 +41,7 @@ def score_clip(pipeline: Pipeline, clip_path: Path = SHIPPED, cameras: int | Non
 
 
 def score_roadside(pipeline: Pipeline, clip: RoadsideClip) -> dict[str, Any]:
-    """The roadside clip by its protocol: 2D recall at IoU > 0.4, and fused centres within 1.5 m."""
+    """The roadside clip by its protocol: 2D recall at IoU > 0.4, and fused centres of cars and vans within 1.5 m."""
     references = recalled = false = 0
     fused = CentreScore(ROADSIDE_MATCH_M)
     for step in ROADSIDE_STEPS:
@@ -56,10 +57,11 @@ def score_roadside(pipeline: Pipeline, clip: RoadsideClip) -> dict[str, Any]:
         encoded = tuple(EncodedFrame(camera_id, data, step) for camera_id, data in frames.items())
         boxes = pipeline.run(FrameSet(clip.site, encoded, step * 100_000_000, step + 1)).boxes
         center = clip.reference(step)[0]
-        fused.add(boxes.center, np.ones(len(boxes), dtype=bool), center, _seen_by_two(clip, step, center))
+        small = np.isin(clip.reference_classes(step), ROADSIDE_3D_CLASSES)
+        fused.add(boxes.center, np.ones(len(boxes), dtype=bool), center, small & _seen_by_two(clip, step, center))
     return {
         "2d": {"references": references, "recalled": recalled, "false": false},
-        "3d_seen_by_two_within_40_m": fused.summary(),
+        "3d_cars_and_vans_seen_by_two_within_40_m": fused.summary(),
     }
 
 

@@ -94,17 +94,24 @@ def match(ours: Array, truth: Array, ignored: Array) -> tuple[NDArray[np.bool_],
 
     A box takes the free vehicle that it overlaps most. What takes none is false, unless it lies on an ignored extent (M, 4).
     """
+    taken, outcome = outcomes(ours, truth, ignored)
+    return taken, int((outcome == 0).sum())
+
+
+def outcomes(ours: Array, truth: Array, ignored: Array) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """As :func:`match`: which vehicles (N,) are found, and what became of each box (K,): 1 right, 0 false, -1 left out."""
     overlap = iou_2d(ours, truth)
     taken = np.zeros(len(truth), dtype=bool)
-    false = 0
+    outcome = np.zeros(len(ours), dtype=np.int64)
     for row, excused in enumerate(_part_on(ours, ignored) > MIN_ON_IGNORED):
         free = np.where(taken, 0.0, overlap[row])
         best = int(free.argmax()) if len(free) else -1
         if best >= 0 and free[best] > MIN_IOU:
             taken[best] = True
-        elif not excused:
-            false += 1
-    return taken, false
+            outcome[row] = 1
+        elif excused:
+            outcome[row] = -1
+    return taken, outcome
 
 
 def _part_on(ours: Array, ignored: Array) -> Array:

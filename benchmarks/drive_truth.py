@@ -9,7 +9,7 @@ car are not known.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,9 +45,9 @@ class DriveFrame:
     """(M, 4) where a box is neither right nor wrong, clipped to the picture."""
 
 
-def drive_frames(clip: PandasetClip, every: int) -> Iterator[DriveFrame]:
-    """Every camera's frame of every n-th step."""
-    for step in range(0, clip.steps, every):
+def drive_frames(clip: PandasetClip, steps: Iterable[int]) -> Iterator[DriveFrame]:
+    """Every camera's frame of some steps."""
+    for step in steps:
         boxes = clip.boxes(step)
         for camera_id in clip.camera_ids:
             camera = clip.camera(camera_id, step)

@@ -62,6 +62,10 @@ class RoadsideClip:
         # The recording turns its boxes clockwise; the LiDAR stands level, so yaw keeps its meaning in the world.
         return center, dims, wrap_angle([-t["yaw"] for t in rows])
 
+    def reference_classes(self, step: int) -> tuple[str, ...]:
+        """The recording's class of each vehicle of :meth:`reference`, in its order."""
+        return tuple(t["class_name"] for t in self.tracks[step] if t["class_name"] not in NOT_VEHICLES)
+
     def reference_2d(self, camera_id: str, step: int) -> Array:
         """Image boxes (N, 4) of the reference vehicles that the protocol counts in a camera."""
         camera = self.site.camera(camera_id)
