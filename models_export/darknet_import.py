@@ -118,3 +118,7 @@ def command(
         raise typer.Exit(1) from None
     entry = manifest.networks["detector"]
     console.print(f"pack '{manifest.name}' in {out}: {entry.parameters:,} parameters; {manifest.scores['detector']}")
+
+
+if __name__ == "__main__":
+    app()
