@@ -18,13 +18,14 @@ from service.frames import FrameSet, decode
 from service.fusion import CameraParts, FusedBoxes, FusionSettings, fuse
 from service.geometry.boxes import Boxes, clip_extents, cut_edges
 from service.geometry.camera import Camera, UInt8Image, yaw_from_alpha
-from service.lifting import LiftSettings, Measurements, lift
+from service.lifting import LiftSettings, Measurements, lift_with_terms
 from service.nets.canvas import canvas_size
 from service.nets.depth import DepthNet
 from service.nets.detector import Detections, Detector, edge_sigma
 from service.nets.multibin import Multibin, MultibinEstimates, crop_vehicles
 from service.nets.pack import Pack
 from service.paper_fusion import PaperFusionSettings, fuse_paper
+from service.residuals import BoxProblem
 from service.site import Site
 
 _UNKNOWN_YAW_SIGMA = np.pi / np.sqrt(3.0)
@@ -113,9 +114,9 @@ class Pipeline:
             readings = self._read_depth(frame_set, cameras, images, found)
         with _timed(timing, "lift"):
             measurements = self._measurements(cameras, found, estimates, readings)
-            lifted = self._lift(cameras, frame_set.site, measurements)
+            lifted, terms = self._lift(cameras, frame_set.site, measurements)
         with _timed(timing, "fuse"):
-            fused = self._fuse(lifted, measurements.camera_index, cameras)
+            fused = self._fuse(lifted, terms, measurements.camera_index, cameras)
             keep = self._reported(fused.boxes)
         timing["total"] = 1e3 * (time.perf_counter() - started)
         return SetResult(
@@ -130,18 +131,20 @@ class Pipeline:
             parts=None if fused.parts is None else _timed_parts(fused.parts.of_rows(keep), frame_set, cameras),
         )
 
-    def _lift(self, cameras: list[Camera], site: Site, measurements: Measurements) -> Boxes:
+    def _lift(self, cameras: list[Camera], site: Site, measurements: Measurements) -> tuple[Boxes, BoxProblem | None]:
         if self.settings.method == "paper":
             # Imported here: the default method does not pay for it.
             from service.paper_lifting import lift_paper
 
-            return lift_paper(cameras, site.ground, measurements, self.settings.lift)
-        return lift(cameras, site.ground, measurements, self.settings.lift)
+            return lift_paper(cameras, site.ground, measurements, self.settings.lift), None
+        return lift_with_terms(cameras, site.ground, measurements, self.settings.lift)
 
-    def _fuse(self, lifted: Boxes, camera_index: NDArray[np.int64], cameras: list[Camera]) -> FusedBoxes:
+    def _fuse(
+        self, lifted: Boxes, terms: BoxProblem | None, camera_index: NDArray[np.int64], cameras: list[Camera]
+    ) -> FusedBoxes:
         if self.settings.method == "paper":
             return fuse_paper(lifted, camera_index, cameras, self.settings.paper_fusion)
-        return fuse(lifted, camera_index, cameras, self.settings.fusion)
+        return fuse(lifted, camera_index, cameras, self.settings.fusion, terms)
 
     def _reported(self, boxes: Boxes) -> NDArray[np.bool_]:
         confident = boxes.score >= self.settings.min_fused_score
