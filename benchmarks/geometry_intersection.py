@@ -46,11 +46,12 @@ class Intersection:
     cameras: list[Camera]
     scans: list[Scan]
 
-    def sequences(self) -> list[list[Scan]]:
-        """The scans without their gaps."""
-        times = np.array([scan.time_s for scan in self.scans])
-        cuts = np.flatnonzero(np.diff(times) > _SEQUENCE_GAP_S) + 1
-        return [self.scans[a:b] for a, b in zip([0, *cuts], [*cuts, len(times)], strict=True)]
+
+def sequences_of(scans: list[Scan]) -> list[list[Scan]]:
+    """Scans in order of time, parted at their gaps."""
+    times = np.array([scan.time_s for scan in scans])
+    cuts = np.flatnonzero(np.diff(times) > _SEQUENCE_GAP_S) + 1
+    return [scans[a:b] for a, b in zip([0, *cuts], [*cuts, len(times)], strict=True)]
 
 
 def load_intersection(lidar: str) -> Intersection:

@@ -6,17 +6,18 @@ degrees, 5 cm of ground, 8 % of depth.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
-from benchmarks.geometry_scores import Row, Sigmas, lift_all, measurements_of, score
+from benchmarks.geometry_scores import Row, Sigmas, lift_all, lift_with, measurements_of, score
 from service.fusion import FusionSettings, fuse
 from service.geometry.boxes import Boxes, project_extents
 from service.geometry.camera import Camera
 from service.geometry.ground import GroundPlane
 from service.geometry.transforms import Array, pole_camera_pose, rigid, rotation_z
 from service.lifting import LiftSettings, Measurements
+from service.residuals import BoxProblem
 
 K = np.array([[642.0, 0.0, 641.5], [0.0, 642.0, 191.5], [0.0, 0.0, 1.0]])
 WIDTH, HEIGHT = 1284, 384
@@ -105,14 +106,17 @@ def fusion_table(inexact: bool, seed: int = 0, count: int = CARS // 4) -> dict[s
     true = [_camera(f"pole{i}", xy, a, 5.0, FUSION_PITCH_RAD) for i, (a, xy) in enumerate(named)]
     truth = _cars(count, rng.uniform(-2.0, 2.0, (count, 2)), rng)
     bias = SIGMAS.dims_lwh * rng.normal(size=(count, 3)) if inexact else 0.0
-    # Each car meets its own calibration errors, so that the figures do not hang on one draw of four.
-    believed = [[_turned(camera, rng) for camera in true] if inexact else true for _ in range(count)]
-    measured = [_measured(camera, truth, bias, rng) for camera in true]
+    # Each car meets its own calibration errors, so that the figures do not hang on one draw of four. Views go by car.
+    believed = [_turned(camera, rng) if inexact else camera for _ in range(count) for camera in true]
+    seen = [_measured(camera, truth, bias, rng) for camera in true]
+    order = np.arange(FUSION_CAMERAS * count).reshape(FUSION_CAMERAS, count).T.ravel()
+    together = Measurements(**{f.name: np.concatenate([getattr(m, f.name) for m in seen])[order] for f in fields(Measurements)})
+    measured = replace(together, camera_index=np.arange(len(together)))
     rows: dict[str, Row] = {}
     for label, method, settings in (("paper", "paper", NO_GROUND), ("map + ground", "map", TRUE_GROUND)):
-        single = [_lift_each(method, [b[i] for b in believed], m, settings) for i, m in enumerate(measured)]
-        rows[f"{label}, one camera"] = score(Boxes.concatenate(single), np.tile(truth, (FUSION_CAMERAS, 1)))
-        rows[f"{label}, fused"] = _fused_row(single, true, truth, INEXACT if inexact else EXACT)
+        boxes, terms = lift_with(method, believed, GroundPlane(), measured, settings)
+        rows[f"{label}, one camera"] = score(boxes, np.repeat(truth, FUSION_CAMERAS, axis=0))
+        rows[f"{label}, fused"] = _fused_row(boxes, terms, true, truth, INEXACT if inexact else EXACT)
     return rows
 
 
@@ -124,18 +128,13 @@ def _turned(camera: Camera, rng: np.random.Generator) -> Camera:
     return replace(camera, T_cam_world=camera.T_cam_world @ here @ turn @ back)
 
 
-def _lift_each(method: str, cameras: list[Camera], measurements: Measurements, settings: LiftSettings) -> Boxes:
-    """Row n lifted with ``cameras[n]``."""
-    own = replace(measurements, camera_index=np.arange(len(measurements)))
-    return lift_all(method, cameras, GroundPlane(), own, settings)
-
-
-def _fused_row(single: list[Boxes], cameras: list[Camera], truth: Array, settings: FusionSettings) -> Row:
+def _fused_row(boxes: Boxes, terms: BoxProblem | None, cameras: list[Camera], truth: Array, settings: FusionSettings) -> Row:
     """Each car's boxes fused; the fused box is the one that the first camera's went into."""
     owner = np.arange(len(cameras))
     parts, joined = [], 0
     for row in range(len(truth)):
-        result = fuse(Boxes.concatenate([boxes.take(np.array([row])) for boxes in single]), owner, cameras, settings)
+        mine = row * len(cameras) + owner
+        result = fuse(boxes.take(mine), owner, cameras, settings, None if terms is None else terms.take(mine))
         parts.append(result.boxes.take(result.source[:1]))
         joined += int((result.source[1:] == result.source[0]).sum())
     pairs = len(truth) * (len(cameras) - 1)

@@ -6,18 +6,19 @@ other scans' vehicles than those that are scored. Sizes are the means of those s
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.geometry_intersection import CLASSES, LIDARS, Intersection, Scan, load_intersection, wholly_inside
-from benchmarks.geometry_scores import Row, Sigmas, lift_all, measurements_of, score
+from benchmarks.geometry_intersection import CLASSES, LIDARS, Intersection, Scan, load_intersection, sequences_of, wholly_inside
+from benchmarks.geometry_scores import Row, Sigmas, lift_with, measurements_of, score
 from service.fusion import FusionSettings, fuse
 from service.geometry.boxes import Boxes
 from service.geometry.ground import Ground, fit_grid, fit_plane
 from service.geometry.transforms import Array
 from service.lifting import LiftSettings, Measurements
+from service.residuals import BoxProblem
 
 PIXEL_SIGMA = 2.0
 YAW_SIGMA_RAD = float(np.deg2rad(4.0))
@@ -90,21 +91,26 @@ def bottoms_of(scans: list[Scan]) -> Array:
     return truth[:, :3] - 0.5 * truth[:, 5:6] * [0.0, 0.0, 1.0]
 
 
-def ground_settings(ground: Ground, bottoms: Array, cameras: int) -> LiftSettings:
-    """The lift told how well a ground fits the bottoms (N, 3) that it was fitted to: rms, the tails clipped.
+def fit_ground(name: str, scans: list[Scan]) -> Ground:
+    """The plane or grid that fits the bottoms of the vehicles best."""
+    bottoms = bottoms_of(scans)
+    return fit_grid(bottoms, CELL_M, BEND) if name == "grid" else fit_plane(bottoms)
 
-    Cameras that are fused afterwards stand their boxes on the same ground, whose error does not average out: each takes it
-    for sqrt(cameras) times as large, so that together they count it once.
+
+def ground_settings(name: str, scans: list[Scan]) -> LiftSettings:
+    """The lift told how well a ground fits vehicles of a recording that it was not fitted to: rms, the tails clipped.
+
+    Each sequence of the scans is held against the ground of the others; how well a grid fits its own vehicles says too little.
     """
-    miss = np.abs(bottoms[:, 2] - ground.height_at(bottoms))
+    sequences = sequences_of(scans)
+    misses = []
+    for left_out, sequence in enumerate(sequences):
+        others = [scan for row, other in enumerate(sequences) if row != left_out for scan in other]
+        bottoms = bottoms_of(sequence)
+        misses.append(np.abs(bottoms[:, 2] - fit_ground(name, others).height_at(bottoms)))
+    miss = np.concatenate(misses)
     clip = CLIP_SIGMAS * _MAD_TO_SIGMA * float(np.median(miss))
-    sigma = float(np.sqrt(np.mean(np.minimum(miss, clip) ** 2)))
-    return LiftSettings(ground_sigma_m=sigma * np.sqrt(cameras), ground_sigma_per_m=0.0)
-
-
-def shared_sizes(measurements: Measurements, cameras: int) -> Measurements:
-    """The same for sizes: the class's mean is wrong by the same amount in every camera."""
-    return replace(measurements, sigma_dims=measurements.sigma_dims * np.sqrt(cameras))
+    return LiftSettings(ground_sigma_m=float(np.sqrt(np.mean(np.minimum(miss, clip) ** 2))), ground_sigma_per_m=0.0)
 
 
 def halves(place: Intersection) -> dict[str, list[tuple[list[Scan], list[Scan]]]]:
@@ -112,7 +118,7 @@ def halves(place: Intersection) -> dict[str, list[tuple[list[Scan], list[Scan]]]
 
     Alternate scans of one sequence hold the same vehicles a tenth of a second apart; whole sequences (other days) do not.
     """
-    sequences = place.sequences()
+    sequences = sequences_of(place.scans)
     alternate = (place.scans[::2], place.scans[1::2])
     days = ([s for q in sequences[::2] for s in q], [s for q in sequences[1::2] for s in q])
     return {"alternate scans": [alternate, alternate[::-1]], "whole sequences": [days, days[::-1]]}
@@ -134,13 +140,11 @@ def _table(folds: list[tuple[Intersection, tuple[list[Scan], list[Scan]]]], seed
         rng = np.random.default_rng(seed)
         lifted, fused = [], []
         for place, (fitted, scored) in folds:
-            bottoms = bottoms_of(fitted)
-            ground: Ground = fit_grid(bottoms, CELL_M, BEND) if ground_name == "grid" else fit_plane(bottoms)
+            ground, settings = fit_ground(ground_name, fitted), ground_settings(ground_name, fitted)
             views = views_of(place, scored, class_dims(fitted), rng)
-            alone, together = (ground_settings(ground, bottoms, cameras) for cameras in (1, 2))
-            lifted.append((lift_all(method, place.cameras, ground, views.measurements, alone), views))
-            shared = shared_sizes(views.measurements, 2)
-            fused.append(_fused(place, lift_all(method, place.cameras, ground, shared, together), views))
+            boxes, terms = lift_with(method, place.cameras, ground, views.measurements, settings)
+            lifted.append((boxes, views))
+            fused.append(_fused(place, boxes, terms, views))
         label = f"{method}, ground: {ground_name}"
         for index, camera in enumerate(folds[0][0].cameras):
             single = [(boxes.take(v.camera == index), v.truth[v.camera == index]) for boxes, v in lifted]
@@ -165,21 +169,22 @@ class Fused:
     """Those that are of one vehicle."""
 
 
-def _fused(place: Intersection, boxes: Boxes, views: Views) -> Fused:
+def _fused(place: Intersection, boxes: Boxes, terms: BoxProblem | None, views: Views) -> Fused:
     """Every scan fused by itself, with all boxes of it; a vehicle's fused box is the one its first camera went into."""
     parts, joined, rightly = [], 0, 0
     both = views.seen_by_both()
     for number in np.unique(views.scan):
         rows = np.flatnonzero(views.scan == number)
-        result = fuse(boxes.take(rows), views.camera[rows], place.cameras, FUSION)
+        mine = None if terms is None else terms.take(rows)
+        result = fuse(boxes.take(rows), views.camera[rows], place.cameras, FUSION, mine)
         first, second = rows[views.camera[rows] == 0], rows[views.camera[rows] == 1]
         into = np.zeros(len(boxes), dtype=np.int64)
         into[rows] = result.source
         together = into[first][:, None] == into[second]
         joined += int(together.sum())
         rightly += int((together & (views.vehicle[first][:, None] == views.vehicle[second])).sum())
-        mine = first[both[first]]
-        parts.append((result.boxes.take(into[mine]), views.truth[mine]))
+        seen = first[both[first]]
+        parts.append((result.boxes.take(into[seen]), views.truth[seen]))
     return Fused(Boxes.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]), joined, rightly)
 
 

@@ -13,8 +13,9 @@ from service.geometry.camera import Camera
 from service.geometry.ground import Ground
 from service.geometry.iou import clip_convex_pairs, rectangle_corners
 from service.geometry.transforms import Array, wrap_angle
-from service.lifting import LiftSettings, Measurements, lift
+from service.lifting import LiftSettings, Measurements, lift, lift_with_terms
 from service.paper_lifting import lift_paper
+from service.residuals import BoxProblem
 
 Lift = Callable[[Sequence[Camera], Ground, Measurements, LiftSettings | None], Boxes]
 METHODS: dict[str, Lift] = {"paper": lift_paper, "map": lift}
@@ -71,6 +72,15 @@ def lift_all(
     rows = np.arange(len(measurements))
     parts = [METHODS[method](cameras, ground, take(measurements, rows[s : s + _CHUNK]), settings) for s in starts]
     return Boxes.concatenate(parts)
+
+
+def lift_with(
+    method: str, cameras: Sequence[Camera], ground: Ground, measurements: Measurements, settings: LiftSettings | None = None
+) -> tuple[Boxes, BoxProblem | None]:
+    """Boxes, and the terms that fusion can solve anew; the paper's method has none."""
+    if method == "map":
+        return lift_with_terms(cameras, ground, measurements, settings)
+    return lift_all(method, cameras, ground, measurements, settings), None
 
 
 def paired_iou_3d(a: Array, b: Array) -> Array:

@@ -16,7 +16,7 @@ from service.geometry.boxes import clip_extents, project_extents
 from service.geometry.camera import Camera
 from service.geometry.ground import GroundPlane
 from service.geometry.transforms import Array, pole_camera_pose
-from service.lifting import Measurements, lift
+from service.lifting import Measurements, lift_with_terms
 from service.tracking import Tracker
 
 BOXES = (1, 4, 16, 64, 128, 256, 512)
@@ -82,8 +82,8 @@ def _cost(count: int, repeats: int) -> dict[str, float]:
     # A crossing as wide as its traffic, so that many vehicles do not stand behind the cameras.
     cameras = crossing_cameras(radius_m=15.0 + 4.0 * np.sqrt(count / _CAMERAS))
     measurements, ground = crossing_boxes(count, cameras), GroundPlane()
-    boxes = lift(cameras, ground, measurements)
-    fused = fuse(boxes, measurements.camera_index, cameras)
+    boxes, terms = lift_with_terms(cameras, ground, measurements)
+    fused = fuse(boxes, measurements.camera_index, cameras, terms=terms)
     tracker, now_ns = Tracker(), 10**18
 
     def track() -> None:
@@ -91,8 +91,8 @@ def _cost(count: int, repeats: int) -> dict[str, float]:
         now_ns += _STEP_NS
         tracker.update(fused, now_ns)
 
-    lift_ms = _median_ms(lambda: lift(cameras, ground, measurements), repeats)
-    fuse_ms = _median_ms(lambda: fuse(boxes, measurements.camera_index, cameras), repeats)
+    lift_ms = _median_ms(lambda: lift_with_terms(cameras, ground, measurements), repeats)
+    fuse_ms = _median_ms(lambda: fuse(boxes, measurements.camera_index, cameras, terms=terms), repeats)
     track_ms = _median_ms(track, repeats)
     total = lift_ms + fuse_ms + track_ms
     figures = {"lift_ms": lift_ms, "fuse_ms": fuse_ms, "track_ms": track_ms, "total_ms": total, "us_a_box": 1e3 * total / count}

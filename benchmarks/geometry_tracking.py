@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from benchmarks.geometry_intersection import Scan, load_intersection
+from benchmarks.geometry_intersection import Scan, load_intersection, sequences_of
 from benchmarks.scored_sets import Found, Wanted
 from benchmarks.tracking_scores import MIN_IOU, count_scene, moments, no_counts
 from service.fusion import fuse
@@ -52,7 +52,7 @@ def run_tracking(seed: int = 0, sequences: int | None = None) -> dict[str, dict[
     """Scores of the southern LiDAR's sequences (all, or the first few), with both cameras and with one that is away a while."""
     site = load_intersection("south")
     runs = {"both cameras": False, "one away for 3 s": True}
-    scenes = site.sequences()[:sequences]
+    scenes = sequences_of(site.scans)[:sequences]
     result = {}
     for name, away in runs.items():
         rng = np.random.default_rng(seed)

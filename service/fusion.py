@@ -1,7 +1,8 @@
 """Fusion: the boxes that several cameras lifted become one box a vehicle.
 
-Cameras join one after another; each assigns its boxes to the clusters so far in bird's-eye view. A cluster is then combined
-by information (inverse covariance), with two corrections for errors that the boxes' covariances do not know:
+Cameras join one after another; each assigns its boxes to the clusters so far in bird's-eye view. A cluster is then one box:
+solved from the terms of all its cameras (:mod:`service.joint`) where those are known, else combined by information (inverse
+covariance). Two errors that the boxes' covariances do not know are added:
 
 - calibration: every camera's positions are inflated with its distance, independently of the other cameras;
 - size: all cameras run the same network on the same kind of car, so its size errors are shared and more cameras do not
@@ -12,18 +13,22 @@ by information (inverse covariance), with two corrections for errors that the bo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.association import Index, best_of_duplicates, gated_assignment, inverse_2x2, mahalanobis_cost
-from service.geometry.boxes import STATE_DIM, Boxes, box_states
+from service.combination import combine, summable
+from service.geometry.boxes import Boxes
 from service.geometry.camera import Camera
-from service.geometry.transforms import Array, wrap_angle
+from service.geometry.transforms import Array
+from service.joint import shared_covariance
+from service.residuals import BoxProblem
+from service.solver import SolverSettings
 from service.views import whole_in_view
 
-_DIMS = slice(3, 6)
+_XY = np.array([0, 1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +36,7 @@ class CameraParts:
     """What the cameras contributed to M fused boxes: K boxes, one a camera and vehicle."""
 
     boxes: Boxes
-    """K boxes; their covariances include what calibration leaves open, and the shared part of the size's error."""
+    """K boxes as lifted; their covariances include what calibration leaves open, and the shared part of the size's error."""
     row: Index
     """(K,) the fused box that each went into."""
     camera: Index
@@ -82,11 +87,21 @@ class FusionSettings:
     Near 1, for another vehicle may hide it."""
     view_range_m: float = 40.0
     """A camera is expected to report vehicles up to this distance, metres."""
+    solver: SolverSettings = field(default_factory=lambda: SolverSettings(step_tolerance=2.0))
+    """For vehicles of several cameras; they start near the solution."""
 
 
-def fuse(boxes: Boxes, camera_index: Index, cameras: Sequence[Camera], settings: FusionSettings | None = None) -> FusedBoxes:
+def fuse(
+    boxes: Boxes,
+    camera_index: Index,
+    cameras: Sequence[Camera],
+    settings: FusionSettings | None = None,
+    terms: BoxProblem | None = None,
+) -> FusedBoxes:
     """One box a vehicle from N boxes, ``camera_index`` (N,) saying which of the ``cameras`` lifted each.
 
+    terms: what the N boxes were solved from (:func:`service.lifting.lift_with_terms`). With them a vehicle of several cameras
+    is solved anew from everything that these saw; without, their boxes are combined by covariance, which is less exact.
     Score: 1 - prod(1 - s) over the cameras that contributed (false alarms of different cameras rarely coincide); then each
     camera that should see the vehicle and is silent multiplies the odds by ``silence_ratio``.
     """
@@ -95,10 +110,14 @@ def fuse(boxes: Boxes, camera_index: Index, cameras: Sequence[Camera], settings:
         return FusedBoxes(Boxes.empty(), np.zeros((0, len(cameras)), dtype=bool), np.zeros(0, np.int64))
     keeper = best_of_duplicates(boxes, camera_index, settings.duplicate_iou, settings.duplicate_distance_m)
     kept = np.flatnonzero(keeper == np.arange(len(boxes)))
-    single, owner = boxes.take(kept), camera_index[kept]
-    error = _calibration_covariance(single, owner, cameras, settings)
-    cluster = _cluster(single, owner, error, settings)
-    fused, parts, cluster = _fuse_and_merge(single, owner, error, cluster, settings)
+    owner = camera_index[kept]
+    if len(kept) < len(boxes):
+        single, terms = boxes.take(kept), None if terms is None else terms.take(kept)
+    else:
+        single = boxes
+    single, terms = _loosened(single, terms, owner, cameras, settings)
+    cluster = _cluster(single, owner, terms, settings)
+    fused, parts, cluster = _fuse_and_merge(single, owner, terms, cluster, settings)
     members = np.zeros((len(fused), len(cameras)), dtype=bool)
     members[parts.row, parts.camera] = True
     score = _discounted(fused.score, _silences(fused, members, cameras, settings), settings.silence_ratio)
@@ -106,26 +125,37 @@ def fuse(boxes: Boxes, camera_index: Index, cameras: Sequence[Camera], settings:
     rank = np.argsort(order)
     position = np.zeros(len(boxes), np.int64)
     position[kept] = np.arange(len(kept))
-    ranked = _with_score(fused, score).take(order)
+    ranked = replace(fused, score=score).take(order)
     parts = CameraParts(parts.boxes, rank[parts.row], parts.camera)
     return FusedBoxes(ranked, members[order], rank[cluster][position[keeper]], parts)
 
 
-def _calibration_covariance(boxes: Boxes, owner: Index, cameras: Sequence[Camera], settings: FusionSettings) -> Array:
-    """Covariances (N, 7, 7) to add to the boxes for what calibration leaves open; height rests on the ground plane."""
-    origin = np.stack([camera.position_m[:2] for camera in cameras])
-    offset = boxes.center[:, :2] - origin[owner]
-    error = np.zeros((len(boxes), STATE_DIM, STATE_DIM))
-    error[:, 2, 2] = settings.calibration_sigma_m**2
-    error[:, 0, 0] = error[:, 1, 1] = error[:, 2, 2] + settings.calibration_sigma_rad**2 * (offset * offset).sum(1)
-    return error
+def _loosened(
+    boxes: Boxes, terms: BoxProblem | None, owner: Index, cameras: Sequence[Camera], settings: FusionSettings
+) -> tuple[Boxes, BoxProblem | None]:
+    """Boxes and terms that know what calibration leaves open, each camera on its own.
+
+    Boxes are displaced; height rests on the ground. Pictures are shifted, by the same angle and displacement.
+    """
+    origin = np.stack([camera.position_m for camera in cameras])
+    offset = boxes.center - origin[owner]
+    near, angle = settings.calibration_sigma_m**2, settings.calibration_sigma_rad**2
+    squared = offset * offset
+    covariance = boxes.covariance.copy()
+    covariance[:, _XY, _XY] += (near + angle * (squared[:, 0] + squared[:, 1]))[:, None]
+    covariance[:, 2, 2] += near
+    if terms is not None and near + angle > 0:
+        terms = replace(terms, shift_sigma=np.sqrt(angle + near / squared.sum(1)))
+    return replace(boxes, covariance=covariance), terms
 
 
-def _cluster(boxes: Boxes, owner: Index, error: Array, settings: FusionSettings) -> Index:
+def _cluster(boxes: Boxes, owner: Index, terms: BoxProblem | None, settings: FusionSettings) -> Index:
     """Cluster numbers (N,), 0 and up. The camera with most confidence starts; the others join one after another."""
+    covariance = boxes.covariance[:, :2, :2]
+    if terms is not None:
+        covariance = covariance + shared_covariance(boxes.covariance, terms)
     # Relative to one box: world coordinates may be large, and information times them would round.
     xy = boxes.center[:, :2] - boxes.center[0, :2]
-    covariance = boxes.covariance[:, :2, :2] + error[:, :2, :2]
     information = inverse_2x2(covariance)
     weighted = (information @ xy[..., None])[..., 0]
     total = np.bincount(owner, weights=boxes.score)
@@ -149,90 +179,39 @@ def _cluster(boxes: Boxes, owner: Index, error: Array, settings: FusionSettings)
 
 
 def _fuse_and_merge(
-    boxes: Boxes, owner: Index, error: Array, cluster: Index, settings: FusionSettings
+    boxes: Boxes, owner: Index, terms: BoxProblem | None, cluster: Index, settings: FusionSettings
 ) -> tuple[Boxes, CameraParts, Index]:
     """Fused boxes, their parts and clusters (N,); clusters that turn out to be one vehicle become one."""
     used = _best_per_camera(boxes, owner, cluster)
-    parts = _parts(boxes.take(used), error[used], cluster[used])
-    fused = _combine(parts, cluster[used])
+    parts = summable(boxes.take(used), cluster[used])
+    fused = combine(parts, cluster[used], None if terms is None else terms.take(used), settings.solver)
     while True:
         everyone = np.zeros(len(fused), np.int64)
         keeper = best_of_duplicates(fused, everyone, settings.duplicate_iou, settings.duplicate_distance_m)
-        survivors, renumbered = np.unique(keeper, return_inverse=True)
-        if len(survivors) == len(fused):
+        if (keeper == np.arange(len(fused))).all():
             return fused, CameraParts(parts, cluster[used], owner[used]), cluster
+        survivors, renumbered = np.unique(keeper, return_inverse=True)
         cluster = renumbered[cluster].astype(np.int64)
         used = _best_per_camera(boxes, owner, cluster)
-        parts = _parts(boxes.take(used), error[used], cluster[used])
-        # Only what has changed is combined again: the inverses are the dearest step.
+        parts = summable(boxes.take(used), cluster[used])
+        # Only what has changed is combined again: that is the dearest step.
         changed = np.flatnonzero(np.bincount(renumbered) > 1)
         mine = np.isin(cluster[used], changed)
-        again = _combine(parts.take(mine), np.searchsorted(changed, cluster[used][mine]))
+        its_terms = None if terms is None else terms.take(used[mine])
+        again = combine(parts.take(mine), np.searchsorted(changed, cluster[used][mine]), its_terms, settings.solver)
         row = np.arange(len(survivors))
         row[changed] = len(survivors) + np.arange(len(changed))
         fused = Boxes.concatenate([fused.take(survivors), again]).take(row)
 
 
 def _best_per_camera(boxes: Boxes, owner: Index, cluster: Index) -> Index:
-    """Rows that count: of each camera's boxes in a cluster the best-scored one."""
-    order = np.lexsort((-boxes.score, owner, cluster))
-    pair = np.stack([cluster[order], owner[order]], 1)
+    """Rows that count, by cluster: of each camera's boxes in a cluster the best-scored one."""
+    pair = cluster * (int(owner.max()) + 1) + owner
+    order = np.lexsort((-boxes.score, pair))
     first = np.ones(len(order), dtype=bool)
-    first[1:] = np.any(pair[1:] != pair[:-1], axis=1)
-    return np.sort(order[first])
-
-
-def _parts(boxes: Boxes, error: Array, cluster: Index) -> Boxes:
-    """The boxes with covariances that may be added up as information: size n-fold, as n cameras share its error."""
-    covariance = boxes.covariance + error
-    others = np.bincount(cluster)[cluster] - 1.0
-    covariance[:, _DIMS, _DIMS] += others[:, None, None] * boxes.covariance[:, _DIMS, _DIMS]
-    return Boxes(boxes.center, boxes.dims_lwh, boxes.yaw, boxes.score, boxes.cls, covariance, boxes.flip_log_odds)
-
-
-def _combine(boxes: Boxes, cluster: Index) -> Boxes:
-    """One box a cluster (numbered 0 .. M-1 without gaps) by information."""
-    rows = int(cluster.max()) + 1
-    information = np.linalg.inv(boxes.covariance)
-    axis = _circular_axis(boxes.yaw, 1.0 / boxes.covariance[:, 6, 6], cluster, rows)
-    aligned = np.cos(boxes.yaw - axis[cluster]) >= 0
-    evidence = np.bincount(cluster, np.where(aligned, 1.0, -1.0) * boxes.flip_log_odds, rows)
-    state = box_states(boxes)
-    state[:, 6] = wrap_angle(boxes.yaw - axis[cluster] + np.where(aligned, 0.0, np.pi))
-    # Relative to the cluster's first member: world coordinates may be large, differences within a cluster are not.
-    reference = np.zeros((rows, STATE_DIM))
-    reference[cluster[::-1], :3] = state[::-1, :3]
-    state -= reference[cluster]
-    # One product adds up the clusters, several times quicker than ``np.add.at``.
-    belongs = (np.arange(rows)[:, None] == cluster).astype(np.float64)
-    sum_information = (belongs @ information.reshape(-1, STATE_DIM**2)).reshape(rows, STATE_DIM, STATE_DIM)
-    sum_weighted = belongs @ (information @ state[..., None])[..., 0]
-    fused_covariance = np.linalg.inv(sum_information)
-    fused = (fused_covariance @ sum_weighted[..., None])[..., 0] + reference
-    return Boxes(
-        center=fused[:, :3],
-        dims_lwh=fused[:, _DIMS],
-        yaw=wrap_angle(axis + fused[:, 6] + np.where(evidence < 0, np.pi, 0.0)),
-        score=1.0 - np.exp(np.bincount(cluster, np.log1p(-np.clip(boxes.score, 0.0, 1.0 - 1e-9)), rows)),
-        cls=_voted_class(boxes, cluster, rows),
-        covariance=0.5 * (fused_covariance + fused_covariance.transpose(0, 2, 1)),
-        flip_log_odds=np.abs(evidence),
-    )
-
-
-def _circular_axis(yaw: Array, weight: Array, cluster: Index, rows: int) -> Array:
-    """Weighted mean axes (M,) of headings (N,), which may be flipped by pi: in [-pi/2, pi/2]."""
-    sine = np.bincount(cluster, weight * np.sin(2 * yaw), rows)
-    cosine = np.bincount(cluster, weight * np.cos(2 * yaw), rows)
-    axis: Array = 0.5 * np.arctan2(sine, cosine)
-    return axis
-
-
-def _voted_class(boxes: Boxes, cluster: Index, rows: int) -> Index:
-    classes = int(boxes.cls.max()) + 1
-    votes = np.bincount(cluster * classes + boxes.cls, boxes.score, rows * classes).reshape(rows, classes)
-    winner: Index = votes.argmax(1).astype(np.int64)
-    return winner
+    first[1:] = np.diff(pair[order]) > 0
+    best: Index = order[first]
+    return best
 
 
 def _silences(fused: Boxes, members: NDArray[np.bool_], cameras: Sequence[Camera], settings: FusionSettings) -> Array:
@@ -247,7 +226,3 @@ def _discounted(score: Array, silences: Array, ratio: float) -> Array:
     kept = score * ratio**silences
     discounted: Array = kept / (kept + 1.0 - score)
     return discounted
-
-
-def _with_score(boxes: Boxes, score: Array) -> Boxes:
-    return Boxes(boxes.center, boxes.dims_lwh, boxes.yaw, score, boxes.cls, boxes.covariance, boxes.flip_log_odds)

@@ -1,31 +1,28 @@
 """Lifting: a 2D box, a size, a yaw (and a depth) become a 3D box with its covariance.
 
-Maximum a posteriori over (x, y, z, l, w, h, yaw) by Levenberg and Marquardt's damped Gauss-Newton, all boxes of a frame set
-at once. The terms stand in :mod:`service.residuals`. The inverse Hessian at the solution is the box's covariance: as honest
-as the sigmas that came in.
+Maximum a posteriori over (x, y, z, l, w, h, yaw), all boxes of a frame set at once. The terms stand in
+:mod:`service.residuals`, the solver in :mod:`service.solver`. The inverse Hessian at the solution is the box's covariance: as
+honest as the sigmas that came in.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.geometry.boxes import BORDER_PX, STATE_DIM, Boxes, box_corners
+from service.geometry.boxes import BORDER_PX, Boxes, box_corners
 from service.geometry.camera import MIN_DEPTH_M, Camera
 from service.geometry.ground import Ground
 from service.geometry.transforms import Array, transform_points, wrap_angle
-from service.residuals import DEPTH, EDGES, GROUND, ROWS, BoxProblem, NormalEquations, normal_equations
+from service.residuals import DEPTH, EDGES, GROUND, ROWS, BoxProblem
+from service.solver import MAX_DIM_M, MIN_DIM_M, SolverSettings, covariance_of, solve
 
-_MIN_DIM_M, _MAX_DIM_M = 0.2, 60.0
 _MIN_SIGMA_PX, _MIN_SIGMA_M, _MIN_SIGMA_RAD = 0.25, 0.01, 0.005
 _MAX_SIGMA_PX, _MAX_SIGMA_M, _MAX_SIGMA_RAD = 1e3, 30.0, np.pi
 _MIN_DEPTH_SIGMA_M, _MAX_DEPTH_M = 0.05, 1000.0
-_CONDITION_FLOOR = 1e-9
-_FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 1e-6, 1e6
-_DIAGONAL = np.arange(STATE_DIM)
 _MIN_START_DEPTH_M = 1.0
 _LENS_PASSES = 2
 _MAX_LENS_MISS = 0.1
@@ -82,10 +79,7 @@ class LiftSettings:
     """Weak pull to the start position; it only keeps boxes finite whose edges are all cut."""
     max_start_depth_m: float = 200.0
     """Starts farther than this (rays near the horizon) are taken from the size instead."""
-    iterations: int = 6
-    """Most solver steps; boxes that have converged stand still before that."""
-    step_tolerance: float = 0.1
-    """A box has converged when its step is shorter than this, in its own sigmas (Mahalanobis)."""
+    solver: SolverSettings = field(default_factory=SolverSettings)
 
 
 def lift(cameras: Sequence[Camera], ground: Ground, measurements: Measurements, settings: LiftSettings | None = None) -> Boxes:
@@ -94,24 +88,32 @@ def lift(cameras: Sequence[Camera], ground: Ground, measurements: Measurements, 
     Finite for any finite input; what cannot be known (all edges cut, box above the horizon) shows in the covariance. A box
     does not depend on the others in the batch.
     """
+    return lift_with_terms(cameras, ground, measurements, settings)[0]
+
+
+def lift_with_terms(
+    cameras: Sequence[Camera], ground: Ground, measurements: Measurements, settings: LiftSettings | None = None
+) -> tuple[Boxes, BoxProblem | None]:
+    """What :func:`lift` gives, and the terms that each box was solved from (None for no box), for fusion."""
     if len(measurements) == 0:
-        return Boxes.empty()
+        return Boxes.empty(), None
     settings = settings or LiftSettings()
     seen = edge_measurements(cameras, measurements, slice(None), settings)
     problem = _problem(ground, seen, measurements, settings)
-    state, equations = _solve(problem, problem.prior, settings)
+    state, hessian = solve(problem, problem.prior, settings.solver)
     for _ in range(_LENS_PASSES if any(camera.has_distortion for camera in cameras) else 0):
         problem = replace(problem, edges=_straightened(cameras, measurements.camera_index, seen.xyxy_px, state, problem))
-        state, equations = _solve(problem, state, settings)
-    return Boxes(
+        state, hessian = solve(problem, state, settings.solver)
+    boxes = Boxes(
         center=state[:, :3],
         dims_lwh=state[:, 3:6],
         yaw=wrap_angle(state[:, 6]),
         score=np.asarray(measurements.score, dtype=np.float64),
         cls=measurements.cls,
-        covariance=_covariance(equations.hessian),
+        covariance=covariance_of(hessian),
         flip_log_odds=np.asarray(measurements.flip_log_odds, dtype=np.float64),
     )
+    return boxes, problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +170,7 @@ def edge_measurements(cameras: Sequence[Camera], m: Measurements, rows: slice, s
         edge_weight=K[:, [0, 1, 0, 1], [0, 1, 0, 1]] / np.clip(m.sigma_px[rows], _MIN_SIGMA_PX, _MAX_SIGMA_PX),
         bottom_ray=rays[:, 0],
         center_ray=rays[:, 1],
-        dims_lwh=np.clip(m.dims_lwh[rows], _MIN_DIM_M, _MAX_DIM_M),
+        dims_lwh=np.clip(m.dims_lwh[rows], MIN_DIM_M, MAX_DIM_M),
         sigma_dims=np.clip(m.sigma_dims[rows], _MIN_SIGMA_M, _MAX_SIGMA_M),
         yaw=wrap_angle(m.yaw[rows]),
         sigma_yaw=np.clip(m.sigma_yaw[rows], _MIN_SIGMA_RAD, _MAX_SIGMA_RAD),
@@ -181,9 +183,10 @@ def _problem(ground: Ground, seen: EdgeMeasurements, m: Measurements, settings: 
     sigma_ground = settings.ground_sigma_m + settings.ground_sigma_per_m * start_depth
     depth, depth_weight = _depth_readings(m)
     position_sigma = np.full((len(m), 3), settings.start_sigma_m)
-    huber = np.full(ROWS, np.inf)
-    huber[EDGES] = huber[DEPTH] = settings.huber_sigmas
-    huber[GROUND] = settings.ground_huber_sigmas
+    huber = np.empty((len(m), ROWS))
+    huber[:, EDGES] = settings.huber_sigmas
+    huber[:, DEPTH] = settings.huber_sigmas
+    huber[:, GROUND] = settings.ground_huber_sigmas
     return BoxProblem(
         R=seen.R,
         t=seen.t,
@@ -257,10 +260,10 @@ def _start(ground: Ground, seen: EdgeMeasurements, settings: LiftSettings) -> tu
     # The rays have depth 1 along the optical axis, the third row of R.
     on_ground = (seen.R[:, 2] * (contact - seen.origin)).sum(1)
     limit = settings.max_start_depth_m
-    with np.errstate(divide="ignore", invalid="ignore"):
-        by_size = dims[:, 2] / (seen.edges[:, 3] - seen.edges[:, 1])
-    by_size = np.clip(np.nan_to_num(by_size, nan=limit, posinf=limit), _MIN_START_DEPTH_M, limit)
-    usable = np.isfinite(on_ground) & (on_ground > _MIN_START_DEPTH_M) & (on_ground < limit)
+    height = seen.edges[:, 3] - seen.edges[:, 1]
+    by_size = dims[:, 2] / np.minimum(np.maximum(height, dims[:, 2] / limit), dims[:, 2] / _MIN_START_DEPTH_M)
+    # False for NaN, too.
+    usable = (on_ground > _MIN_START_DEPTH_M) & (on_ground < limit)
     # The bottom edge belongs to the nearest part of the box: its centre lies half a footprint farther on.
     azimuth = np.arctan2(down[:, 1], down[:, 0])
     turn = seen.yaw - azimuth
@@ -268,54 +271,3 @@ def _start(ground: Ground, seen: EdgeMeasurements, settings: LiftSettings) -> tu
     offset = np.stack([reach * np.cos(azimuth), reach * np.sin(azimuth), 0.5 * dims[:, 2]], 1)
     start = np.where(usable[:, None], contact + offset, seen.origin + seen.center_ray * by_size[:, None])
     return start, np.where(usable, on_ground, by_size)
-
-
-def _solve(problem: BoxProblem, start: Array, settings: LiftSettings) -> tuple[Array, NormalEquations]:
-    """Damped Gauss-Newton on every box at once; each box has its own damping, and leaves the batch when it has converged."""
-    state, now = start.copy(), normal_equations(problem, start)
-    total = now
-    rows = np.arange(len(start))
-    damping = np.full(len(start), _FIRST_DAMPING)
-    moving = state
-    for _ in range(settings.iterations):
-        damped = now.hessian.copy()
-        damped[:, _DIAGONAL, _DIAGONAL] *= 1.0 + damping[:, None]
-        step = np.linalg.solve(damped, -now.gradient[..., None])[..., 0]
-        trial = moving + step
-        np.minimum(np.maximum(trial[:, 3:6], _MIN_DIM_M), _MAX_DIM_M, out=trial[:, 3:6])
-        then = normal_equations(problem, trial)
-        better = then.cost <= now.cost
-        # Twice what the quadratic model promises: the step's squared length in the box's own sigmas.
-        going = -(now.gradient * step).sum(1) > settings.step_tolerance**2
-        if not better.all():
-            trial, then = np.where(better[:, None], trial, moving), _chosen(better, then, now)
-        if len(rows) == len(start):
-            state, total = trial, then
-        else:
-            state[rows] = trial
-            for kept, new in zip(total, then, strict=True):
-                kept[rows] = new
-        if not going.any():
-            break
-        damping = np.minimum(np.maximum(damping * np.where(better, 0.2, 10.0), _MIN_DAMPING), _MAX_DAMPING)
-        moving, now = trial, then
-        if not going.all():
-            rows, damping, moving, problem = rows[going], damping[going], trial[going], problem.take(going)
-            now = NormalEquations(*(kept[going] for kept in then))
-    return state, total
-
-
-def _chosen(better: NDArray[np.bool_], then: NormalEquations, now: NormalEquations) -> NormalEquations:
-    """``then`` where the step was better (N,), else ``now``."""
-    pick = [better.reshape(-1, *(1,) * (new.ndim - 1)) for new in then]
-    return NormalEquations(*(np.where(p, new, old) for p, new, old in zip(pick, then, now, strict=True)))
-
-
-def _covariance(hessian: Array) -> Array:
-    """Inverse Hessians (N, 7, 7), symmetric and positive definite."""
-    # Scaled to a unit diagonal first: metres, radians and far boxes otherwise differ by many orders of magnitude.
-    scale = 1.0 / np.sqrt(np.diagonal(hessian, axis1=1, axis2=2))
-    outer = scale[:, :, None] * scale[:, None, :]
-    inverse = np.linalg.inv(hessian * outer + _CONDITION_FLOOR * np.eye(STATE_DIM)) * outer
-    symmetric: Array = 0.5 * (inverse + inverse.transpose(0, 2, 1))
-    return symmetric

@@ -12,14 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.geometry.boxes import STATE_DIM
+from service.geometry.boxes import STATE_DIM, YAW
 from service.geometry.transforms import Array, wrap_angle
 
 MOTION_DIM = STATE_DIM + 2
 """x, y, z, l, w, h, yaw, speed, yaw rate."""
-YAW, SPEED, YAW_RATE = 6, 7, 8
-_DIMS = slice(3, 6)
+SPEED, YAW_RATE = 7, 8
+_DIMS = np.arange(3, 6)
 _BOX = slice(0, STATE_DIM)
+_DIAGONAL = np.arange(MOTION_DIM)
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,8 @@ def predicted(state: Array, covariance: Array, elapsed_s: float, settings: Motio
     middle = state[:, YAW] + 0.5 * elapsed_s * rate
     c, s = np.cos(middle), np.sin(middle)
     way = elapsed_s * speed
-    F = np.tile(np.eye(MOTION_DIM), (len(state), 1, 1))
+    F = np.zeros((len(state), MOTION_DIM, MOTION_DIM))
+    F[:, _DIAGONAL, _DIAGONAL] = 1.0
     F[:, 0, YAW], F[:, 1, YAW] = -way * s, way * c
     F[:, 0, SPEED], F[:, 1, SPEED] = elapsed_s * c, elapsed_s * s
     F[:, 0, YAW_RATE], F[:, 1, YAW_RATE] = -0.5 * elapsed_s * way * s, 0.5 * elapsed_s * way * c
@@ -91,18 +93,16 @@ def predicted(state: Array, covariance: Array, elapsed_s: float, settings: Motio
 
 def _noise(c: Array, s: Array, rolling: Array, elapsed_s: float, settings: MotionSettings) -> Array:
     """Covariances (T, 9, 9) of what vehicles with headings of cosine c and sine s (T,) do by themselves in ``elapsed_s``."""
-    noise = np.zeros((len(c), MOTION_DIM, MOTION_DIM))
     push = np.zeros((len(c), MOTION_DIM))
     reach = settings.acceleration_sigma * elapsed_s
     push[:, 0], push[:, 1], push[:, SPEED] = 0.5 * elapsed_s * reach * c, 0.5 * elapsed_s * reach * s, reach
-    noise += push[:, :, None] * push[:, None, :]
+    noise = push[:, :, None] * push[:, None, :]
     turn = settings.yaw_acceleration_sigma * elapsed_s * rolling
     noise[:, YAW, YAW] = 0.25 * elapsed_s**2 * turn**2 + settings.yaw_drift_rad**2 * elapsed_s
     noise[:, YAW, YAW_RATE] = noise[:, YAW_RATE, YAW] = 0.5 * elapsed_s * turn**2
     noise[:, YAW_RATE, YAW_RATE] = turn**2
     noise[:, 2, 2] = settings.climb_sigma**2 * elapsed_s
-    diagonal = np.arange(_DIMS.start, _DIMS.stop)
-    noise[:, diagonal, diagonal] = settings.size_drift_m**2 * elapsed_s
+    noise[:, _DIMS, _DIMS] = settings.size_drift_m**2 * elapsed_s
     _add_along(noise, -s, c, settings.slip_sigma**2 * elapsed_s * rolling)
     return noise
 

@@ -19,7 +19,7 @@ from service.fusion import CameraParts, FusedBoxes, FusionSettings, fuse
 from service.geometry.boxes import Boxes
 from service.geometry.camera import Camera
 from service.guidance import Guidance, GuidanceSettings, HardMode, View
-from service.lifting import LiftSettings, Measurements, lift
+from service.lifting import LiftSettings, Measurements, lift_with_terms
 from service.measuring import Still, cut_detected, measure
 from service.nets.canvas import Canvases, canvas_size
 from service.nets.depth import DepthNet, InverseDepth
@@ -28,6 +28,7 @@ from service.nets.detector import NMS_IOU, SCORE_THRESHOLD, Detector
 from service.nets.multibin import Multibin, MultibinEstimates, cut_crops
 from service.nets.pack import Pack
 from service.paper_fusion import PaperFusionSettings, fuse_paper
+from service.residuals import BoxProblem
 from service.site import Site
 
 
@@ -122,13 +123,16 @@ class Pipeline:
             readings = self._read_depth(maps, found)
         with _timed(timing, "lift"):
             measured = measure(stills, found, estimates, readings, self.detector.spec, self.multibin.spec)
-            lifted, index = self._lift(cameras, frame_set.site, measured), measured.camera_index
+            lifted, terms = self._lift(cameras, frame_set.site, measured)
+            index = measured.camera_index
         hard: frozenset[str] = frozenset()
         if self.guidance is not None:
             with _timed(timing, "guided"):
                 lifted, index, hard = self._guided(self.guidance, stills, found, maps, frame_set.site, lifted, index)
+            # Guided boxes were not solved from terms: a set that has any is combined by covariance.
+            terms = None if hard else terms
         with _timed(timing, "fuse"):
-            fused = self._fuse(lifted, index, cameras)
+            fused = self._fuse(lifted, terms, index, cameras)
             keep = self._reported(fused.boxes)
         timing["total"] = 1e3 * (time.perf_counter() - started)
         return SetResult(
@@ -144,13 +148,13 @@ class Pipeline:
             hard=hard,
         )
 
-    def _lift(self, cameras: list[Camera], site: Site, measurements: Measurements) -> Boxes:
+    def _lift(self, cameras: list[Camera], site: Site, measurements: Measurements) -> tuple[Boxes, BoxProblem | None]:
         if self.settings.method == "paper":
             # Imported here: the default method does not pay for it.
             from service.paper_lifting import lift_paper
 
-            return lift_paper(cameras, site.ground, measurements, self.settings.lift)
-        return lift(cameras, site.ground, measurements, self.settings.lift)
+            return lift_paper(cameras, site.ground, measurements, self.settings.lift), None
+        return lift_with_terms(cameras, site.ground, measurements, self.settings.lift)
 
     def _guided(
         self,
@@ -170,10 +174,12 @@ class Pipeline:
         lifted, index = guidance.add(views, hard, cameras, site.ground, lifted, index, self.settings.method)
         return lifted, index, frozenset(camera.id for camera, is_hard in zip(cameras, hard, strict=True) if is_hard)
 
-    def _fuse(self, lifted: Boxes, camera_index: NDArray[np.int64], cameras: list[Camera]) -> FusedBoxes:
+    def _fuse(
+        self, lifted: Boxes, terms: BoxProblem | None, camera_index: NDArray[np.int64], cameras: list[Camera]
+    ) -> FusedBoxes:
         if self.settings.method == "paper":
             return fuse_paper(lifted, camera_index, cameras, self.settings.paper_fusion)
-        return fuse(lifted, camera_index, cameras, self.settings.fusion)
+        return fuse(lifted, camera_index, cameras, self.settings.fusion, terms)
 
     def _reported(self, boxes: Boxes) -> NDArray[np.bool_]:
         confident = boxes.score >= self.settings.min_fused_score

@@ -6,7 +6,7 @@ undistorted normalised coordinates (x/z, y/z); distances there are pixels over t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from service.geometry.boxes import CORNER_SIGNS, STATE_DIM
 from service.geometry.camera import MIN_DEPTH_M
 from service.geometry.ground import Ground
-from service.geometry.transforms import Array, wrap_angle
+from service.geometry.transforms import Array
 
 EDGES, GROUND, DEPTH = slice(0, 4), 4, 5
 """Rows of the residual: left, top, right, bottom; bottom face on the ground; visible surface at the read depth."""
 
 ROWS = 6
-_EDGE_AXIS = np.array([0, 1, 0, 1])
+_EDGE_START = np.array([0, 8, 0, 8])
 _FAR_PARALLEL = 1e-9
 _TINY = 1e-30
 _SIGNS_T = np.ascontiguousarray(CORNER_SIGNS.T)
@@ -30,7 +30,7 @@ _OUTWARD = np.array([-1.0, -1.0, 1.0, 1.0])
 _DIAGONAL = np.arange(STATE_DIM)
 _PER_BOX = (
     *("R", "t", "origin", "edges", "edge_weight", "hinged", "prior", "prior_weight"),
-    *("ground_weight", "ray", "depth", "depth_weight"),
+    *("ground_weight", "ray", "depth", "depth_weight", "huber"),
 )
 
 
@@ -51,7 +51,7 @@ class BoxProblem:
     hinged: NDArray[np.bool_]
     """(N, 4) edges cut by the image border: the box must reach them and may go past."""
     prior: Array
-    """(N, 7) start position, predicted size, predicted yaw."""
+    """(N, 7) start position, predicted size, predicted yaw; states are compared with it as they are, so yaw is not wrapped."""
     prior_weight: Array
     """(N, 7) 1 / sigma of the prior."""
     ground: Ground
@@ -65,11 +65,23 @@ class BoxProblem:
     depth_weight: Array
     """(N,) 1 / sigma, 1/m; 0 where there is no reading."""
     huber: Array
-    """(6,) residual (sigmas) from which a row counts linearly."""
+    """(N, 6) residual (sigmas) from which a row counts linearly."""
+    shift_sigma: Array | None = None
+    """(N,) how far, normalised, the whole picture may be shifted along each axis, one sigma: left and right edge move
+    together, top and bottom too. None: not at all."""
 
-    def take(self, index: NDArray[np.bool_]) -> BoxProblem:
-        """The boxes at a mask (N,)."""
-        return replace(self, **{name: getattr(self, name)[index] for name in _PER_BOX})
+    def take(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> BoxProblem:
+        """The boxes at an index or mask."""
+        # Rows by number and ``take`` are several times quicker than a mask.
+        rows = np.flatnonzero(index) if index.dtype == np.bool_ else index
+        shift = None if self.shift_sigma is None else self.shift_sigma[rows]
+        return BoxProblem(
+            **{name: getattr(self, name).take(rows, 0) for name in _PER_BOX}, ground=self.ground, shift_sigma=shift
+        )
+
+    def normal_equations(self, state: Array) -> NormalEquations:
+        """Of every box at its state (N, 7)."""
+        return normal_equations(self, state)
 
 
 class NormalEquations(NamedTuple):
@@ -84,84 +96,121 @@ def box_axes(yaw: Array) -> Array:
     """World directions (N, 3, 3) of the boxes' length, width and height, one a row."""
     axes = np.zeros((len(yaw), 3, 3))
     axes[:, 0, 0] = axes[:, 1, 1] = np.cos(yaw)
-    axes[:, 0, 1] = np.sin(yaw)
-    axes[:, 1, 0] = -axes[:, 0, 1]
+    sine = np.sin(yaw)
+    axes[:, 0, 1], axes[:, 1, 0] = sine, -sine
     axes[:, 2, 2] = 1.0
     return axes
 
 
 def normal_equations(problem: BoxProblem, state: Array) -> NormalEquations:
     """Cost, gradient and Hessian at states (N, 7): Huber on the rows, squares on the prior."""
-    residual, jacobian = residuals(problem, state)
+    rows, shift = _whitened(problem, state)
+    residual, jacobian = rows[..., STATE_DIM], rows[..., :STATE_DIM]
     magnitude = np.abs(residual)
-    inner = np.minimum(magnitude, problem.huber)
-    robust = np.maximum(inner, _TINY) / np.maximum(magnitude, _TINY)
+    robust = np.minimum(problem.huber / np.maximum(magnitude, _TINY), 1.0)
+    inner = robust * magnitude
+    weighted_t = (jacobian * robust[..., None]).transpose(0, 2, 1)
+    cost = (inner * (magnitude - 0.5 * inner)).sum(1)
+    if problem.shift_sigma is not None:
+        cost -= _free_shift(problem.shift_sigma, shift, robust, residual, weighted_t)
+    # One product gives the Hessian and, from the residual's column, the gradient.
+    equations = weighted_t @ rows
+    hessian, gradient = equations[..., :STATE_DIM], equations[..., STATE_DIM]
     offset = state - problem.prior
-    offset[:, 6] = wrap_angle(offset[:, 6])
     information = problem.prior_weight * problem.prior_weight
     pull = offset * information
-    weighted_t = (jacobian * robust[..., None]).transpose(0, 2, 1)
-    hessian = weighted_t @ jacobian
     hessian[:, _DIAGONAL, _DIAGONAL] += information
-    gradient = (weighted_t @ residual[..., None])[..., 0] + pull
-    cost = (inner * (magnitude - 0.5 * inner)).sum(1) + 0.5 * (offset * pull).sum(1)
+    gradient += pull
+    cost += 0.5 * (offset * pull).sum(1)
     return NormalEquations(cost, gradient, hessian)
 
 
 def residuals(problem: BoxProblem, state: Array) -> tuple[Array, Array]:
     """Whitened residuals (N, 6) and Jacobians (N, 6, 7) of everything but the prior, at states (N, 7)."""
-    residual = np.empty((len(state), ROWS))
-    jacobian = np.zeros((len(state), ROWS, STATE_DIM))
+    rows, _ = _whitened(problem, state)
+    return rows[..., STATE_DIM], rows[..., :STATE_DIM]
+
+
+def _whitened(problem: BoxProblem, state: Array) -> tuple[Array, Array]:
+    """Rows (N, 6, 8), Jacobian and residual side by side, and the weights (N, 4) at which the edges count."""
+    rows = np.zeros((len(state), ROWS, STATE_DIM + 1))
     axes = box_axes(state[:, 6])
-    _edge_rows(problem, state, axes, residual, jacobian)
-    _ground_row(problem, state, residual, jacobian)
-    if np.any(problem.depth_weight):
-        _depth_row(problem, state, axes, residual, jacobian)
-    else:
-        residual[:, DEPTH] = 0.0
-    return residual, jacobian
+    weight = _edge_rows(problem, state, axes, rows)
+    _ground_row(problem, state, rows)
+    if problem.depth_weight.any():
+        _depth_row(problem, state, axes, rows)
+    return rows, weight
 
 
-def _edge_rows(problem: BoxProblem, state: Array, axes: Array, residual: Array, jacobian: Array) -> None:
-    """Each edge against the corner that makes it at this state (the active corner)."""
-    half = 0.5 * state[:, 3:6]
-    R = problem.R
+def _free_shift(sigma: Array, weight: Array, robust: Array, residual: Array, weighted_t: Array) -> Array:
+    """Let each picture shift by ``sigma`` (N,): takes from ``weighted_t`` (N, 7, 6), in place, what a shift explains.
+
+    ``weight`` (N, 4): how much an edge's residual changes with it. Returns what the cost (N,) loses by the best shift. Left
+    and right shift together, top and bottom too: W becomes W - W 1 (1/sigma^2 + 1' W 1)^-1 1' W for each of the pairs.
+    """
+    edges = weighted_t[..., EDGES]
+    pulls = robust[:, EDGES] * weight
+    scale = 1.0 / (_summed_pairs(pulls * weight) + 1.0 / (sigma * sigma)[:, None])
+    miss = _summed_pairs(pulls * residual[:, EDGES])
+    common = _summed_pairs(edges * weight[:, None]) * scale[:, None]
+    edges -= np.concatenate([common, common], 2) * pulls[:, None]
+    explained: Array = 0.5 * (scale * miss * miss).sum(1)
+    return explained
+
+
+def _summed_pairs(edges: Array) -> Array:
+    """Left plus right, top plus bottom (..., 2) of values of the edges (..., 4)."""
+    return edges[..., :2] + edges[..., 2:]
+
+
+def _edge_rows(problem: BoxProblem, state: Array, axes: Array, rows: Array) -> Array:
+    """Each edge against the corner that makes it at this state (the active corner); returns the edges' weights (N, 4)."""
+    count, R = len(state), problem.R
+    # World axes and box axes, one a column, in the camera's frame.
+    columns = np.concatenate([R, R @ axes.transpose(0, 2, 1)], 2)
+    half_axes = columns[..., 3:] * (0.5 * state[:, None, 3:6])
     center_cam = (R @ state[:, :3, None])[..., 0] + problem.t
     # Corners (N, 3, 8): coordinate by coordinate, so that extremes are sought along contiguous memory.
-    corners = (R @ (axes * half[..., None]).transpose(0, 2, 1)) @ _SIGNS_T + center_cam[..., None]
+    corners = (half_axes.reshape(-1, 3) @ _SIGNS_T).reshape(count, 3, 8) + center_cam[..., None]
     depth = np.maximum(corners[:, 2], MIN_DEPTH_M)
     image = corners[:, :2] / depth[:, None]
     active = np.concatenate([image.argmin(2), image.argmax(2)], 1)
-    rows = np.arange(len(state))[:, None]
-    seen = image[rows, _EDGE_AXIS, active]
+    box = np.arange(0, 8 * count, 8)[:, None]
+    seen = image.ravel().take(active + 2 * box + _EDGE_START)
     miss = seen - problem.edges
-    # A cut edge is content when the box goes past it: below it at the left and top, above it at the right and bottom.
-    weight = np.where(problem.hinged & (miss * _OUTWARD > 0), 0.0, problem.edge_weight)
-    # The image coordinate's gradient over the corner's world position, then chained through size and yaw.
-    scale = weight / depth[rows, active]
-    over_corner = R[:, _EDGE_AXIS] * scale[..., None] - (seen * scale)[..., None] * R[:, 2:]
-    over_axes = over_corner @ axes.transpose(0, 2, 1)
-    signs = _HALF_SIGNS[active]
-    residual[:, EDGES] = miss * weight
-    jacobian[:, EDGES, :3] = over_corner
-    jacobian[:, EDGES, 3:6] = signs * over_axes
+    weight = problem.edge_weight
+    if problem.hinged.any():
+        # A cut edge is content when the box goes past it: below it at the left and top, above it at the right and bottom.
+        weight = np.where(problem.hinged & (miss * _OUTWARD > 0), 0.0, weight)
+    # The image coordinate's gradient over the corner's position in the camera's frame, then over world and box axes.
+    over_corner = np.zeros((count, 4, 3))
+    scale = weight / depth.ravel().take(active + box)
+    over_corner[:, ::2, 0], over_corner[:, 1::2, 1] = scale[:, ::2], scale[:, 1::2]
+    over_corner[..., 2] = -seen * scale
+    over = over_corner @ columns
+    signs = _HALF_SIGNS.take(active, 0)
+    edges = rows[:, EDGES]
+    edges[..., :3] = over[..., :3]
+    edges[..., 3:6] = signs * over[..., 3:]
     reach = signs[..., :2] * state[:, None, 3:5]
-    jacobian[:, EDGES, 6] = reach[..., 0] * over_axes[..., 1] - reach[..., 1] * over_axes[..., 0]
+    edges[..., 6] = reach[..., 0] * over[..., 4] - reach[..., 1] * over[..., 3]
+    edges[..., 7] = miss * weight
+    return weight
 
 
-def _ground_row(problem: BoxProblem, state: Array, residual: Array, jacobian: Array) -> None:
+def _ground_row(problem: BoxProblem, state: Array, rows: Array) -> None:
     """Centre of the bottom face on the ground, or on its tangent plane below the box where the ground is a grid."""
     normal, offset = problem.ground.tangent_at(state[:, :2])
     weight = problem.ground_weight
     gap = (state[:, :3] * normal).sum(1) - 0.5 * normal[..., 2] * state[:, 5] - offset
-    residual[:, GROUND] = gap * weight
-    jacobian[:, GROUND, :3] = normal * weight[:, None]
-    jacobian[:, GROUND, 5] = -0.5 * normal[..., 2] * weight
+    rows[:, GROUND, :3] = normal * weight[:, None]
+    rows[:, GROUND, 5] = -0.5 * normal[..., 2] * weight
+    rows[:, GROUND, 7] = gap * weight
 
 
-def _depth_row(problem: BoxProblem, state: Array, axes: Array, residual: Array, jacobian: Array) -> None:
+def _depth_row(problem: BoxProblem, state: Array, axes: Array, rows: Array) -> None:
     """Depth at which the ray through the 2D box's centre enters the 3D box; of the box's centre if the ray misses it."""
-    rows = np.arange(len(state))
+    box = np.arange(len(state))
     half = 0.5 * state[:, 3:6]
     to_center = state[:, :3] - problem.origin
     along = (axes @ problem.ray[..., None])[..., 0]
@@ -172,16 +221,16 @@ def _depth_row(problem: BoxProblem, state: Array, axes: Array, residual: Array, 
     enter = np.where(parallel, -np.inf, (to_center_box - facing * half) / speed)
     leave = np.where(parallel, np.inf, (to_center_box + facing * half) / speed)
     face = enter.argmax(1)
-    first = enter[rows, face]
+    first = enter[box, face]
     hit = (first <= leave.min(1)) & (first > 0)
-    normal, rate = axes[rows, face], speed[rows, face]
+    normal, rate = axes[box, face], speed[box, face]
     # d(normal)/d(yaw): the length axis turns into the width axis, that one into the opposite of the length axis.
-    turned = np.stack([axes[:, 1], -axes[:, 0], np.zeros_like(axes[:, 0])], 1)[rows, face]
+    turned = np.stack([axes[:, 1], -axes[:, 0], np.zeros_like(axes[:, 0])], 1)[box, face]
     over_center = np.where(hit[:, None], normal / rate[:, None], problem.R[:, 2])
     surface = np.where(hit, first, (problem.R[:, 2] * to_center).sum(1))
     over_yaw = (turned * (to_center - first[:, None] * problem.ray)).sum(1) / rate
     weight = problem.depth_weight
-    residual[:, DEPTH] = np.where(weight > 0, (surface - problem.depth) * weight, 0.0)
-    jacobian[:, DEPTH, :3] = over_center * weight[:, None]
-    jacobian[rows, DEPTH, 3 + face] = np.where(hit, -0.5 * facing[rows, face] / rate, 0.0) * weight
-    jacobian[:, DEPTH, 6] = np.where(hit, over_yaw, 0.0) * weight
+    rows[:, DEPTH, :3] = over_center * weight[:, None]
+    rows[box, DEPTH, 3 + face] = np.where(hit, -0.5 * facing[box, face] / rate, 0.0) * weight
+    rows[:, DEPTH, 6] = np.where(hit, over_yaw, 0.0) * weight
+    rows[:, DEPTH, 7] = np.where(weight > 0, (surface - problem.depth) * weight, 0.0)

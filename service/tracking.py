@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from service.association import Index, gated_assignment, mahalanobis_cost
 from service.fusion import CameraParts, FusedBoxes
-from service.geometry.boxes import STATE_DIM, Boxes, box_states
+from service.geometry.boxes import STATE_DIM, YAW, Boxes, box_states
 from service.geometry.transforms import Array, wrap_angle
-from service.motion import SPEED, YAW, MotionSettings, blurred, corrected, newborn, predicted, turned_about, velocity
+from service.motion import SPEED, MotionSettings, blurred, corrected, newborn, predicted, turned_about, velocity
 
 _BOX = slice(0, STATE_DIM)
 _NS_PER_S = 1e9
@@ -90,7 +90,13 @@ class _Tracks:
     """(T,) log-odds that the vehicle exists."""
 
     def take(self, index: Index | NDArray[np.bool_]) -> _Tracks:
-        return _Tracks(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        return _Tracks(
+            self.number[index],
+            self.state[index],
+            self.covariance[index],
+            self.flip_evidence[index],
+            self.existence[index],
+        )
 
     def joined(self, other: _Tracks) -> _Tracks:
         return _Tracks(**{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)})
@@ -147,16 +153,15 @@ class Tracker:
         age_s, spread_s = _ages(fused.parts, at_ns, settings)
         then_s = max((at_ns - before_ns) / _NS_PER_S - age_s, 0.0)
         rows, columns = self._match(boxes, self._expected(before, tracks, then_s, spread_s) if age_s + spread_s else tracks)
-        is_new = np.ones(len(boxes), dtype=bool)
-        is_new[rows] = False
-        born = _born(boxes.take(is_new), self._next_number + np.arange(int(is_new.sum())), age_s, settings)
-        self._next_number += len(born.number)
-        matched = np.zeros(len(tracks.number), dtype=bool)
-        matched[columns] = True
-        fed = _fed(before, tracks, fused, (rows, columns), (before_ns, at_ns), age_s + spread_s > 0, settings)
-        joined = fed.joined(born)
-        seen = joined.take(np.argsort(np.concatenate([rows, np.flatnonzero(is_new)])))
-        self._tracks, self._now_ns = joined.joined(tracks.take(~matched)), at_ns
+        seen = _fed(before, tracks, fused, (rows, columns), (before_ns, at_ns), age_s + spread_s > 0, settings)
+        if len(rows) < len(boxes):
+            is_new = _others(rows, len(boxes))
+            born = _born(boxes.take(is_new), self._next_number + np.arange(len(is_new)), age_s, settings)
+            self._next_number += len(is_new)
+            seen, rows = seen.joined(born), np.concatenate([rows, is_new])
+        seen = seen.take(np.argsort(rows))
+        unseen = _others(columns, len(tracks.number))
+        self._tracks, self._now_ns = seen.joined(tracks.take(unseen)) if len(unseen) else seen, at_ns
         self._remember(_Past(at_ns, fused, before, before_ns, seen.number))
         return seen
 
@@ -205,6 +210,13 @@ class Tracker:
             np.sqrt(seen.covariance[:, SPEED, SPEED]),
             1.0 / (1.0 + np.exp(-seen.existence)),
         )
+
+
+def _others(rows: Index, count: int) -> Index:
+    """Those of 0 .. count - 1 that are not among ``rows``."""
+    free = np.ones(count, dtype=bool)
+    free[rows] = False
+    return np.flatnonzero(free)
 
 
 def _born(boxes: Boxes, number: Index, age_s: float, settings: TrackSettings) -> _Tracks:

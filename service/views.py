@@ -20,24 +20,24 @@ def whole_in_view(boxes: Boxes, cameras: Sequence[Camera], range_m: float) -> ND
     if len(boxes) == 0 or len(cameras) == 0:
         return np.zeros((len(boxes), len(cameras)), dtype=bool)
     T = np.stack([camera.T_cam_world for camera in cameras])
-    corners = box_corners(boxes.center, boxes.dims_lwh, boxes.yaw).reshape(-1, 3)
-    seen = (corners @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]).reshape(len(cameras), len(boxes), 8, 3)
-    in_front = (seen[..., 2] > MIN_DEPTH_M).all(2)
-    pixels = _pixels(cameras, seen)
-    limits = np.array([[camera.width - 1.0, camera.height - 1.0] for camera in cameras])
-    inside = (pixels.min(2) >= 0).all(2) & (pixels.max(2) <= limits[:, None]).all(2)
+    points = np.empty((len(boxes), 9, 3))
+    points[:, :8], points[:, 8] = box_corners(boxes.center, boxes.dims_lwh, boxes.yaw), boxes.center
+    points_cam = points.reshape(-1, 3) @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
+    pixels = _pixels(cameras, points_cam)
+    limits = np.array([[[camera.width - 1.0, camera.height - 1.0]] for camera in cameras])
+    inside = ((pixels >= 0.0) & (pixels <= limits)).all(2) & (points_cam[..., 2] > MIN_DEPTH_M)
     # The camera's centre is where its transform gives zero, so distance is the length of the transformed centre.
-    center = boxes.center @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
-    near = np.einsum("cmi,cmi->cm", center, center) <= range_m**2
-    whole: NDArray[np.bool_] = (in_front & inside & near).T
+    center = points_cam[:, 8::9]
+    near = (center * center).sum(2) <= range_m**2
+    whole: NDArray[np.bool_] = (inside.reshape(len(cameras), -1, 9).all(2) & near).T
     return whole
 
 
 def _pixels(cameras: Sequence[Camera], points_cam: Array) -> Array:
-    """Pixels (C, M, 8, 2) of points (C, M, 8, 3), each in its own camera's frame."""
+    """Pixels (C, P, 2) of points (C, P, 3), each in its own camera's frame."""
     if any(camera.has_distortion for camera in cameras):
         return np.stack([camera.project_cam(points) for camera, points in zip(cameras, points_cam, strict=True)])
     K = np.stack([camera.K for camera in cameras])
     normalised = points_cam[..., :2] / np.maximum(points_cam[..., 2:], MIN_DEPTH_M)
-    pixels: Array = normalised @ K[:, None, :2, :2].transpose(0, 1, 3, 2) + K[:, None, None, :2, 2]
+    pixels: Array = normalised @ K[:, :2, :2].transpose(0, 2, 1) + K[:, None, :2, 2]
     return pixels

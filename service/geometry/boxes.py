@@ -23,6 +23,9 @@ BORDER_PX = 2.0
 STATE_DIM = 7
 """x, y, z, length, width, height, yaw."""
 
+YAW = 6
+"""Place of the yaw in a state."""
+
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
@@ -48,7 +51,15 @@ class Boxes:
 
     def take(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Boxes:
         """The boxes at an index or mask."""
-        return Boxes(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        return Boxes(
+            self.center[index],
+            self.dims_lwh[index],
+            self.yaw[index],
+            self.score[index],
+            self.cls[index],
+            self.covariance[index],
+            self.flip_log_odds[index],
+        )
 
     @staticmethod
     def empty() -> Boxes:

@@ -53,7 +53,7 @@ class Camera:
         """Rotation (3, 3), world to camera."""
         return self.T_cam_world[:3, :3]
 
-    @property
+    @cached_property
     def has_distortion(self) -> bool:
         """Whether any distortion coefficient is non-zero."""
         return bool(np.any(self.distortion))

@@ -13,11 +13,12 @@ from service.geometry.iou import iou_3d
 from service.geometry.transforms import invert_rigid, pole_camera_pose, rigid, rotation_z, wrap_angle
 from service.lifting import LiftSettings, Measurements, lift
 from service.residuals import ROWS, BoxProblem, normal_equations, residuals
+from service.solver import SolverSettings
 
 K = np.array([[642.0, 0.0, 641.5], [0.0, 642.0, 191.5], [0.0, 0.0, 1.0]])
 SIGMA_DIMS = np.array([0.2, 0.06, 0.06])
 SIGMA_YAW = np.deg2rad(4)
-CONVERGED = LiftSettings(iterations=60, step_tolerance=1e-6)
+CONVERGED = LiftSettings(solver=SolverSettings(iterations=60, step_tolerance=1e-6))
 FLAT_GROUND = LiftSettings(ground_sigma_per_m=0.0)
 
 
@@ -165,7 +166,7 @@ def some_problem(rng, n, hinged):
         ray=rng.normal(size=(n, 3)),
         depth=rng.uniform(5, 30, n),
         depth_weight=rng.uniform(0.5, 2, n),
-        huber=np.full(ROWS, np.inf),
+        huber=np.full((n, ROWS), np.inf),
     )
 
 
@@ -187,7 +188,7 @@ def test_analytic_jacobian_is_the_derivative(hinged):
 
 def test_gradient_is_that_of_the_robust_cost():
     rng = np.random.default_rng(6)
-    problem = replace(some_problem(rng, 50, False), huber=np.full(ROWS, 2.0))
+    problem = replace(some_problem(rng, 50, False), huber=np.full((50, ROWS), 2.0))
     state = np.c_[rng.normal(size=(50, 3)), rng.uniform(1, 4, (50, 3)), rng.uniform(-3, 3, 50)]
     gradient = normal_equations(problem, state).gradient
     numeric = derivative(lambda x: normal_equations(problem, x).cost, state)
