@@ -1,0 +1,105 @@
+"""What lifting is told of detections: whose edges count, at which size of the picture, how sure each reading is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.depth_scale import DepthReadings
+from service.geometry.camera import Camera, yaw_from_alpha
+from service.geometry.transforms import Array, pole_camera_pose
+from service.measuring import Still, cut_detected, measure
+from service.nets.detections import Detections
+from service.nets.detector_spec import DetectorSpec
+from service.nets.error_model import ErrorModel
+from service.nets.multibin import UNCERTAIN, MultibinEstimates, MultibinSpec
+
+K = np.array([[600.0, 0.0, 319.5], [0.0, 600.0, 179.5], [0.0, 0.0, 1.0]])
+CAMERA = Camera("north", 640, 360, K, pole_camera_pose([0.0, 0.0, 6.0], 0.3, 0.3))
+DETECTOR = DetectorSpec(("car",), (8,), (((20.0, 10.0),),), 320, ErrorModel(1.0, 0.0, 0.0, 2.0))
+HEAD = MultibinSpec(
+    64, np.array([0.0, np.pi]), np.array([[4.4, 1.8, 1.5]]), (ErrorModel(0.2, 0, 0, 1),) * 3, ErrorModel(0.07, 0, 0, 1)
+)
+INNER, CUT = [100.0, 60.0, 160.0, 100.0], [-3.0, 60.0, 40.0, 100.0]
+SURE = np.array([[0.02, 0.1, 0.05, 0.04, 1.5, 1.6, 1.7, 1.8]])
+
+
+def still(factor: int = 2) -> Still:
+    image = np.random.default_rng(0).integers(0, 255, (360, 640, 3), dtype=np.uint8)
+    return Still(CAMERA, image, image[::factor, ::factor].copy())
+
+
+def found(box: list[float]) -> Detections:
+    return Detections(np.array([box]), np.ones(1), np.zeros(1, np.int64))
+
+
+def says(xyxy_px: Array | None = None, alpha: float = 0.4) -> MultibinEstimates:
+    sigma = None if xyxy_px is None else SURE
+    return MultibinEstimates(np.array([alpha]), np.ones(1), np.array([[4.5, 1.8, 1.5]]), xyxy_px, sigma)
+
+
+def measured(box: list[float], estimates: MultibinEstimates, factor: int = 2):  # type: ignore[no-untyped-def]
+    return measure([still(factor)], [found(box)], estimates, DepthReadings.none(1), DETECTOR, HEAD)
+
+
+def test_the_detectors_edges_are_told_in_pixels_of_the_large_picture() -> None:
+    told = measured(INNER, says())
+    np.testing.assert_allclose(told.xyxy_px, [[200.5, 120.5, 320.5, 200.5]])
+    # One pixel of the small picture is two of the large one.
+    np.testing.assert_allclose(told.sigma_px, 2.0)
+    np.testing.assert_allclose(told.sigma_dims, 0.2)
+
+
+def test_at_one_size_nothing_is_scaled() -> None:
+    told = measured(INNER, says(), factor=1)
+    np.testing.assert_allclose(told.xyxy_px, [INNER])
+    np.testing.assert_allclose(told.sigma_px, 1.0)
+
+
+def test_a_head_that_reads_edges_is_believed_with_its_own_sigmas() -> None:
+    edges = np.array([[201.0, 121.0, 322.0, 199.0]])
+    told = measured(INNER, says(edges))
+    np.testing.assert_array_equal(told.xyxy_px, edges)
+    np.testing.assert_array_equal(told.sigma_px, SURE[:, 4:])
+    np.testing.assert_array_equal(told.sigma_dims, SURE[:, 1:4])
+    assert told.sigma_yaw[0] == SURE[0, UNCERTAIN.index("alpha")]
+
+
+def test_an_edge_that_the_border_cuts_stays_at_the_border() -> None:
+    told = measured(CUT, says(np.array([[-40.0, 121.0, 82.0, 199.0]])))
+    assert told.xyxy_px[0, 0] == 0.0
+    np.testing.assert_array_equal(told.xyxy_px[0, 1:], [121.0, 82.0, 199.0])
+
+
+def test_cut_vehicles_are_read_worse() -> None:
+    np.testing.assert_allclose(measured(CUT, says()).sigma_px, 4.0)
+
+
+@pytest.mark.parametrize("alpha", [-2.0, 0.4])
+def test_yaw_is_about_the_ray_through_the_detected_box(alpha: float) -> None:
+    told = measured(INNER, says(np.array([[150.0, 121.0, 322.0, 199.0]]), alpha))
+    assert told.yaw[0] == pytest.approx(float(yaw_from_alpha(CAMERA, [alpha], [[260.5, 160.5]])[0]))
+
+
+def test_a_heading_that_is_no_number_may_be_any() -> None:
+    told = measured(INNER, says(alpha=float("nan")))
+    assert np.isfinite(told.yaw).all()
+    assert told.sigma_yaw[0] == pytest.approx(np.pi / np.sqrt(3))
+    assert told.flip_log_odds[0] == 0.0
+
+
+def test_cameras_keep_their_order_and_none_may_be_empty_handed() -> None:
+    nothing = Detections(np.zeros((0, 4)), np.zeros(0), np.zeros(0, np.int64))
+    stills, detections = [still(), still()], [nothing, found(INNER)]
+    assert cut_detected(stills, detections, 48).pixels.shape == (1, 48, 48, 3)
+    told = measure(stills, detections, says(), DepthReadings.none(1), DETECTOR, replace(HEAD))
+    np.testing.assert_array_equal(told.camera_index, [1])
+
+
+def test_crops_are_cut_from_the_large_picture() -> None:
+    one = still()
+    window = cut_detected([one], [found(INNER)], 144).window[0]
+    np.testing.assert_array_equal(window, [188, 88, 144])
+    np.testing.assert_array_equal(cut_detected([one], [found(INNER)], 144).pixels[0], one.image[88:232, 188:332])
