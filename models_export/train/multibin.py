@@ -24,7 +24,7 @@ from service.geometry.transforms import Array
 JITTER, MAX_JITTER = 0.06, 0.15
 """Standard deviation and limit of a box edge in training over the box's side: the detector's boxes are not exact either."""
 SIZE_WEIGHT = 6.0
-"""Of the size's likelihood, over those of angle and edges: at 1 the head learned little more of a size than its class's mean."""
+"""Of the size's likelihood, over angle's and edges': at 1 the head learned little more of a size than its class's mean."""
 
 
 class MultibinTask:
