@@ -190,7 +190,6 @@ class Pipeline:
         xyxy = np.concatenate([clip_extents(camera, d.xyxy_px) for camera, d in zip(cameras, found, strict=True)])
         centers = (xyxy[:, :2] + xyxy[:, 2:]) / 2
         yaw, is_cut = np.zeros(len(index)), np.zeros(len(index), dtype=bool)
-        # A quantised network can give a heading vector of length zero, whose angle is not a number.
         headed = np.isfinite(estimates.alpha)
         alpha = np.where(headed, estimates.alpha, 0.0)
         for row, camera in enumerate(cameras):

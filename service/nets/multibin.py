@@ -17,6 +17,8 @@ from service.nets.pack import Network
 CONTEXT = 1.2
 """Side of the square crop over the longer side of the 2D box: a margin, and the box's shape kept."""
 
+_MIN_LENGTH = 0.1
+
 
 @dataclass(frozen=True, eq=False)
 class MultibinSpec:
@@ -52,7 +54,7 @@ class MultibinEstimates:
     """Angles and sizes of N vehicles."""
 
     alpha: Array
-    """(N,) heading relative to the azimuth of the ray through the box's centre, radians in [-pi, pi)."""
+    """(N,) heading relative to the azimuth of the ray through the box's centre, radians in [-pi, pi); NaN: no heading."""
     flip_log_odds: Array
     """(N,) log-odds of alpha against alpha + pi."""
     dims_lwh: Array
@@ -82,12 +84,13 @@ def decode_multibin(
     spec: MultibinSpec,
 ) -> MultibinEstimates:
     """Angles and sizes from raw outputs: bin (cos, sin) pairs (N, B, 2), bin logits (N, B), size residuals (N, 3), metres."""
-    rows = np.arange(len(confidence))
-    angles = np.arctan2(vectors[..., 1], vectors[..., 0]) + spec.bin_centers_rad
     best = confidence.argmax(1)
+    cosine, sine = vectors[np.arange(len(best)), best].T
+    alpha = wrap_angle(np.arctan2(sine, cosine) + spec.bin_centers_rad[best])
     ordered = np.sort(confidence.astype(np.float64), axis=1)
     return MultibinEstimates(
-        alpha=wrap_angle(angles[rows, best]),
+        # The graph makes vectors one long; a quantised one can be too short to point anywhere.
+        alpha=np.where(np.hypot(cosine, sine) < _MIN_LENGTH, np.nan, alpha),
         flip_log_odds=ordered[:, -1] - ordered[:, -2],
         dims_lwh=np.maximum(spec.mean_dims_lwh[cls] + residual, 0.3),
     )
