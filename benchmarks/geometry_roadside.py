@@ -91,24 +91,9 @@ def bottoms_of(scans: list[Scan]) -> Array:
     return truth[:, :3] - 0.5 * truth[:, 5:6] * [0.0, 0.0, 1.0]
 
 
-def fit_ground(name: str, scans: list[Scan]) -> Ground:
-    """The plane or grid that fits the bottoms of the vehicles best."""
-    bottoms = bottoms_of(scans)
-    return fit_grid(bottoms, CELL_M, BEND) if name == "grid" else fit_plane(bottoms)
-
-
-def ground_settings(name: str, scans: list[Scan]) -> LiftSettings:
-    """The lift told how well a ground fits vehicles of a recording that it was not fitted to: rms, the tails clipped.
-
-    Each sequence of the scans is held against the ground of the others; how well a grid fits its own vehicles says too little.
-    """
-    sequences = sequences_of(scans)
-    misses = []
-    for left_out, sequence in enumerate(sequences):
-        others = [scan for row, other in enumerate(sequences) if row != left_out for scan in other]
-        bottoms = bottoms_of(sequence)
-        misses.append(np.abs(bottoms[:, 2] - fit_ground(name, others).height_at(bottoms)))
-    miss = np.concatenate(misses)
+def ground_settings(ground: Ground, bottoms: Array) -> LiftSettings:
+    """The lift told how well a ground fits the bottoms (N, 3) that it was fitted to: rms, the tails clipped."""
+    miss = np.abs(bottoms[:, 2] - ground.height_at(bottoms))
     clip = CLIP_SIGMAS * _MAD_TO_SIGMA * float(np.median(miss))
     return LiftSettings(ground_sigma_m=float(np.sqrt(np.mean(np.minimum(miss, clip) ** 2))), ground_sigma_per_m=0.0)
 
@@ -140,8 +125,10 @@ def _table(folds: list[tuple[Intersection, tuple[list[Scan], list[Scan]]]], seed
         rng = np.random.default_rng(seed)
         lifted, fused = [], []
         for place, (fitted, scored) in folds:
-            ground, settings = fit_ground(ground_name, fitted), ground_settings(ground_name, fitted)
+            bottoms = bottoms_of(fitted)
+            ground: Ground = fit_grid(bottoms, CELL_M, BEND) if ground_name == "grid" else fit_plane(bottoms)
             views = views_of(place, scored, class_dims(fitted), rng)
+            settings = ground_settings(ground, bottoms)
             boxes, terms = lift_with(method, place.cameras, ground, views.measurements, settings)
             lifted.append((boxes, views))
             fused.append(_fused(place, boxes, terms, views))

@@ -72,7 +72,6 @@ def measure(
     score = np.concatenate([own.score for own in found])
     scale = np.tile(np.array([still.scale for still in stills]).reshape(-1, 2), 2)[index]
     xyxy, sigma_px = _edges(seen, cut, score, scale, estimates, detector)
-    # A quantised network can give a heading vector of length zero, whose angle is not a number.
     headed = np.isfinite(estimates.alpha)
     alpha, yaw = np.where(headed, estimates.alpha, 0.0), np.zeros(len(index))
     centers = (seen[:, :2] + seen[:, 2:]) / 2

@@ -22,6 +22,7 @@ UNCERTAIN = ("alpha", "length", "width", "height", "left", "top", "right", "bott
 """Order of the standard deviations that a head may predict: radians, metres, and sides of the crop."""
 _EDGES = slice(4, 8)
 _MIN_WINDOW_PX = 4.0
+_MIN_LENGTH = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +104,7 @@ class MultibinEstimates:
     """Angles and sizes of N vehicles; of heads that predict more, also edges and uncertainties."""
 
     alpha: Array
-    """(N,) heading relative to the azimuth of the ray through the crop's centre, radians in [-pi, pi)."""
+    """(N,) heading relative to the azimuth of the ray through the crop's centre, radians in [-pi, pi); NaN: no heading."""
     flip_log_odds: Array
     """(N,) log-odds of alpha against alpha + pi."""
     dims_lwh: Array
@@ -154,15 +155,16 @@ def decode_multibin(
 ) -> MultibinEstimates:
     """Angles and sizes from raw outputs: bin (cos, sin) pairs (N, B, 2), bin logits (N, B), size residuals (N, 3), metres."""
     rows = np.arange(len(confidence))
-    angles = np.arctan2(vectors[..., 1], vectors[..., 0]) + spec.bin_centers_rad
     logits = confidence.astype(np.float64)
     best = logits.argmax(1)
-    alpha = wrap_angle(angles[rows, best])
+    cosine, sine = vectors[rows, best].T
+    alpha = wrap_angle(np.arctan2(sine, cosine) + spec.bin_centers_rad[best])
     # The other bin whose centre is nearest to alpha + pi answers for the flip; of two bins it is the other one.
     from_flip = np.abs(wrap_angle(spec.bin_centers_rad - alpha[:, None] - np.pi))
     from_flip[rows, best] = np.inf
     return MultibinEstimates(
-        alpha=alpha,
+        # The graph makes vectors one long; a quantised one can be too short to point anywhere.
+        alpha=np.where(np.hypot(cosine, sine) < _MIN_LENGTH, np.nan, alpha),
         flip_log_odds=logits[rows, best] - logits[rows, from_flip.argmin(1)],
         dims_lwh=np.maximum(spec.mean_dims_lwh[cls] + residual, 0.3),
     )

@@ -56,8 +56,8 @@ def test_roadside_figures() -> None:
     rows = run_roadside(every=4)["ground from the other half (alternate scans)"]
     plane, grid, paper = (rows[f"{name}, fused"] for name in ("map, ground: plane", "map, ground: grid", "paper, ground: none"))
     for fused in (plane, grid):
-        assert fused["median_m"] < 0.21
-        assert fused["p90_m"] < 0.65
+        assert fused["median_m"] < 0.18
+        assert fused["p90_m"] < 0.60
         assert fused["iou_above_07_percent"] > 80
         assert fused["association_precision"] > 0.98
         assert fused["association_recall"] > 0.97

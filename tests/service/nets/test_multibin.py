@@ -42,6 +42,13 @@ def test_of_many_bins_the_opposite_one_answers_for_the_flip() -> None:
     assert estimate.flip_log_odds[0] == pytest.approx(8.0)
 
 
+def test_a_vector_without_length_is_no_heading() -> None:
+    vectors = np.array([[[0, 0], [1, 0]], [[1, 0], [0, 0]], [[0.6, 0.8], [0, 0]]], np.float32)
+    confidence = np.array([[2, 1]] * 3, np.float32)
+    estimate = decode_multibin(vectors, confidence, np.zeros((3, 3), np.float32), np.zeros(3, np.int64), SPEC)
+    assert np.isnan(estimate.alpha).tolist() == [True, False, False]
+
+
 def test_a_crop_is_square_centred_and_keeps_the_shape() -> None:
     image = np.zeros((100, 200, 3), np.uint8)
     image[40:60, 80:120] = 255
