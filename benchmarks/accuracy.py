@@ -18,16 +18,20 @@ from rich.progress import Progress
 from rich.table import Table
 
 from benchmarks.clip_score import score_clip, score_roadside
+from benchmarks.drive import RULES as DRIVE_RULES
+from benchmarks.drive import drive_figures, drive_table, score_pack, write_pictures
+from benchmarks.drive_truth import drive_frames
 from benchmarks.kitti_folders import read_ids, read_pair
 from benchmarks.kitti_protocol import CLASSES, DEFAULT_OVERLAPS, as_percent, evaluate
 from benchmarks.kitti_report import kitti_notes, kitti_table
 from benchmarks.machine import describe_machine
-from benchmarks.recordings import open_roadside_clip
+from benchmarks.recordings import PANDASET_CLIP, open_roadside_clip, recording
 from benchmarks.scene_plots import write_plots
 from benchmarks.scene_report import accuracy_table, distance_table, paper_table, tracking_table
 from benchmarks.scene_score import RULES, score_scenes, settings_of, summaries
 from benchmarks.scene_sets import SceneSets, open_scene_sets
 from clients.clip import SHIPPED, ClipError
+from models_export.data.pandaset import open_pandaset
 from service.errors import InputError, QuadliftError
 from service.guidance import HardMode
 from service.nets.pack import load_pack
@@ -58,6 +62,41 @@ def clip_command(
 def roadside_command(pack: PackOption = "edge", as_json: JsonOption = False) -> None:
     """Three real roadside cameras against a LiDAR system's tracks (needs the recording)."""
     _report("roadside", pack, lambda pipeline: score_roadside(pipeline, open_roadside_clip()), as_json)
+
+
+@app.command("pandaset")
+def pandaset_command(
+    pack: PackOption = "edge",
+    recording_path: Annotated[
+        Path | None, typer.Option("--recording", help="Zip of a drive; the known one if left out.")
+    ] = None,
+    every: Annotated[int, typer.Option(min=1, help="Score every n-th step.")] = 5,
+    scores: Annotated[list[float] | None, typer.Option("--score", min=0.01, max=0.99, help="Least score. Repeatable.")] = None,
+    weights: Annotated[Path | None, typer.Option(help="Darknet file of the pack's detector, to run by torch as well.")] = None,
+    pictures: Annotated[Path | None, typer.Option(help="Folder for the frames with truth and boxes.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """The 2D detector on six real cameras of a moving car: recall and false boxes at IoU 0.5 (needs the recording)."""
+    thresholds = scores or [0.1, 0.3, 0.5]
+    with _errors_named():
+        frames = list(drive_frames(open_pandaset(recording_path or recording(PANDASET_CLIP)), every))
+        network = load_pack(pack).networks["detector"]
+        found = {"ONNX Runtime": score_pack(network, frames, thresholds)}
+        difference = None
+        if weights is not None:
+            # Imported here: the other commands need no torch.
+            from benchmarks.drive_torch import score_darknet
+
+            found["torch"], difference = score_darknet(network, weights, frames, thresholds)
+        if pictures is not None:
+            write_pictures(network, frames, thresholds[0], pictures)
+    if as_json:
+        about = {"pack": pack, "rules": DRIVE_RULES, "machine": describe_machine(), "torch_difference": difference}
+        typer.echo(json.dumps({**about, "scores": drive_figures(found)}, indent=1))
+        return
+    console.print(drive_table(f"pandaset, pack {pack}, every {every} steps", found))
+    if difference is not None:
+        notes.print(f"torch and ONNX Runtime: heads differ by {difference:.1e} of their range at most")
 
 
 @app.command("kitti")

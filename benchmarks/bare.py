@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.frames import FrameSet, decode
-from service.nets.canvas import batches
+from service.nets.canvas import Canvases
 from service.nets.multibin import crop_vehicles
 from service.pipeline import Pipeline
 
@@ -51,9 +51,10 @@ class BareLoop:
 
     def _run(self, work: _Work) -> None:
         pipeline = self._pipeline
-        for _, canvases in batches(self._images(work.frame_set)):
-            pipeline.detector.network.run(canvases)
-            pipeline.depth.network.run(canvases)
+        canvases = Canvases(self._images(work.frame_set))
+        for network, fit in ((pipeline.detector.network, pipeline.detector.fit), (pipeline.depth.network, pipeline.depth.fit)):
+            for batch in canvases.batches(fit):
+                network.run(batch.pixels)
         if len(work.crops):
             pipeline.multibin.network.run(work.crops)
 

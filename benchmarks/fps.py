@@ -25,7 +25,8 @@ from benchmarks.measured import Measured
 from clients.clip import ClipError
 from service.errors import OverloadError, QuadliftError
 from service.frames import FrameSet
-from service.nets.pack import load_pack
+from service.nets.pack import Pack, load_pack
+from service.nets.providers import Provider
 from service.pipeline import Pipeline, SetResult
 from service.scheduler import Scheduler
 from service.settings import usable_cores
@@ -63,9 +64,9 @@ def run_inproc(scheduler: Scheduler, sets: Iterator[FrameSet], seconds: float, i
     into.seconds += time.perf_counter() - started
 
 
-def measure(pack: str, sets: Sequence[FrameSet], seconds: float, via: Via, workers: int) -> tuple[Measured, float]:
+def measure(pack: Pack, sets: Sequence[FrameSet], seconds: float, via: Via, workers: int) -> tuple[Measured, float]:
     """Throughput of the service and sets a second of the bare loop, in turns."""
-    pipeline = Pipeline(load_pack(pack))
+    pipeline = Pipeline(pack)
     pipeline.warm_up()
     bare = BareLoop(pipeline, sets)
     ours, bare_sets, bare_seconds = Measured(), 0, 0.0
@@ -80,7 +81,7 @@ def measure(pack: str, sets: Sequence[FrameSet], seconds: float, via: Via, worke
 
 @contextmanager
 def _way(
-    pack: str, pipeline: Pipeline, sets: Sequence[FrameSet], via: Via, workers: int
+    pack: Pack, pipeline: Pipeline, sets: Sequence[FrameSet], via: Via, workers: int
 ) -> Iterator[Callable[[float, Measured], None]]:
     if via is not Via.INPROC:
         # Needs the extra `clients`; the way in process does not.
@@ -88,7 +89,7 @@ def _way(
         from benchmarks.streamed import run_ws
 
         run = run_ws if via is Via.WS else run_http
-        with served(pack, sets[0].site, workers) as url:
+        with served(str(pack.path), pack.networks["detector"].provider, sets[0].site, workers) as url:
             yield lambda seconds, into: run(url, sets, seconds, workers + 1, into)
         return
     scheduler = Scheduler(pipeline, workers=workers)
@@ -99,7 +100,7 @@ def _way(
         scheduler.stop()
 
 
-def report(ours: Measured, bare: float, target: float, pack: str, via: Via, cameras: int) -> dict[str, Any]:
+def report(ours: Measured, bare: float, target: float, pack: str, provider: str, via: Via, cameras: int) -> dict[str, Any]:
     """The figures under their contract names."""
     return {
         "sets_per_second": round(ours.sets_per_second, 2),
@@ -115,6 +116,7 @@ def report(ours: Measured, bare: float, target: float, pack: str, via: Via, came
         "seconds": round(ours.seconds, 2),
         "machine": describe_machine(),
         "pack": pack,
+        "provider": provider,
     }
 
 
@@ -136,7 +138,8 @@ def _print_table(figures: dict[str, Any]) -> None:
     out.print(table)
     out.print(
         f"networks and decoding alone: {figures['bare_sets_per_second']} sets/s, ratio {figures['ratio_to_bare']};"
-        f" dropped {figures['dropped']}; {figures['machine']}"
+        f" dropped {figures['dropped']};"
+        f" pack {figures['pack']} on {figures['provider']}; {figures['machine']}"
     )
 
 
@@ -145,6 +148,7 @@ def bench_fps(
     cameras: Annotated[int | None, typer.Option(min=1, help="Use only the first cameras.")] = None,
     seconds: Annotated[float, typer.Option(min=0.5, help="Time of the measurement, the bare loop aside.")] = 10.0,
     pack: Annotated[str, typer.Option(help="Pack: a shipped one's name, or a folder.")] = "edge",
+    provider: Annotated[Provider, typer.Option(help="What the networks compute on.")] = "auto",
     via: Annotated[
         Via, typer.Option(help="In process, or through a served process on loopback: POST or streams.")
     ] = Via.INPROC,
@@ -155,11 +159,12 @@ def bench_fps(
     """Replay the shipped clip as fast as it goes and compare with a target, 30 sets a second by default."""
     try:
         sets = clip_frame_sets(cameras=cameras, site=load_site(site) if site else None)
-        ours, bare = measure(pack, sets, seconds, via, workers or usable_cores())
+        loaded = load_pack(pack, provider=provider)
+        ours, bare = measure(loaded, sets, seconds, via, workers or usable_cores())
     except (QuadliftError, ClipError) as error:
         console.print(f"[red]{error}[/red]")
         raise typer.Exit(2) from None
-    figures = report(ours, bare, target, pack, via, len(sets[0].frames))
+    figures = report(ours, bare, target, pack, loaded.provider, via, len(sets[0].frames))
     if as_json:
         typer.echo(json.dumps(figures, indent=1))
     else:

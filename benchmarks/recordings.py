@@ -22,6 +22,7 @@ from service.site import Site, parse_site
 
 DEFAULT_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 ROADSIDE_CLIP = "tumtraf_clip.zip"
+PANDASET_CLIP = "pandaset_clip.zip"
 ROADSIDE_STEPS = tuple(range(5, 78, 6))
 """Steps of the roadside protocol: 5, 11, ... 77."""
 NOT_VEHICLES = frozenset({"PEDESTRIAN", "BICYCLE", "MOTORCYCLE"})

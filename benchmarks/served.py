@@ -15,18 +15,19 @@ from clients.client import Client, ServiceError
 from clients.local_service import HOST, LocalServiceError, free_port, running_service
 from service.errors import QuadliftError
 from service.frames import FrameSet
+from service.nets.providers import Provider
 from service.site import Site, save_site
 
 
 @contextmanager
-def served(pack: str, site: Site, workers: int) -> Iterator[str]:
+def served(pack: str, provider: Provider, site: Site, workers: int) -> Iterator[str]:
     """The root URL of a ``quadlift serve`` with one site, for as long as the block runs. Raises QuadliftError."""
     with tempfile.TemporaryDirectory(prefix="quadlift-bench-") as folder:
         site_file = Path(folder) / "site.json"
         save_site(site, site_file)
         port = free_port(0)
         try:
-            with running_service(site_file, port, ["--pack", pack, "--workers", str(workers)]):
+            with running_service(site_file, port, ["--pack", pack, "--provider", provider, "--workers", str(workers)]):
                 yield f"http://{HOST}:{port}"
         except LocalServiceError as error:
             raise QuadliftError(str(error)) from error

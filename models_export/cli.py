@@ -3,128 +3,144 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
-from models_export.edge import NETWORKS, EdgeRecipe, export, train
-from models_export.guided import GuidedRecipe, export_guided, train_guided
-from service.errors import QuadliftError
+from models_export.data.real import RealData
+from models_export.edge import edge_recipe
+from models_export.packing import ExportOptions, export
+from models_export.recipe import PackRecipe, train
+from models_export.train.config import TrainConfig
+from service.errors import InputError, QuadliftError
 
-train_app = typer.Typer(help="Train the networks of pack `edge` on rendered scenes.", no_args_is_help=True)
-export_app = typer.Typer(help="Export trained networks to a pack.", no_args_is_help=True)
+ALL = "all"
+train_app = typer.Typer(add_completion=False)
+export_app = typer.Typer(add_completion=False)
 console = Console()
 
+
+class PackName(StrEnum):
+    """Packs that can be trained."""
+
+    EDGE = "edge"
+
+
+class PrecisionName(StrEnum):
+    """Arithmetic of an exported network."""
+
+    FP32 = "fp32"
+    FP16 = "fp16"
+    INT8 = "int8"
+
+
+NetworkArgument = Annotated[str, typer.Argument(help="A network of the pack (detector, multibin, depth), or 'all'.")]
+PackOption = Annotated[PackName, typer.Option("--pack", help="Whose networks.")]
 DataOption = Annotated[list[Path], typer.Option("--data", help="Data set: a folder of scenes. Repeatable.")]
-RunsOption = Annotated[Path, typer.Option("--runs", help="Folder of checkpoints, logs and curves.")]
-StepsOption = Annotated[int | None, typer.Option(help="Optimiser steps; the recipe's if left out.")]
-BatchOption = Annotated[int | None, typer.Option(help="Samples a step; the recipe's if left out.")]
-DeviceOption = Annotated[str, typer.Option(help="torch device: cpu, cuda, ...")]
-SeedOption = Annotated[int, typer.Option(help="Seed of weights and data order.")]
-ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint.")]
-RUNS = Path("runs/edge")
+RunsOption = Annotated[Path | None, typer.Option(help="Folder of checkpoints, logs and curves; runs/<pack> if left out.")]
 
 
-def _train(
-    networks: tuple[str, ...],
-    data: list[Path],
-    runs: Path,
-    steps: int | None,
-    batch_size: int | None,
-    device: str,
-    seed: int,
-    resume: bool,
-) -> None:
-    recipe = EdgeRecipe()
-    for name in networks:
-        base = recipe.training[name]
-        config = replace(base, device=device, seed=seed, steps=steps or base.steps, batch_size=batch_size or base.batch_size)
-        try:
-            train(name, data, runs, replace(recipe, training={**recipe.training, name: config}), resume=resume)
-        except QuadliftError as error:
-            console.print(f"[red]{error}[/red]")
-            raise typer.Exit(1) from None
-
-
-def _add_train_command(name: str, networks: tuple[str, ...], text: str) -> None:
-    @train_app.command(name, help=text)
-    def command(
-        data: DataOption,
-        runs: RunsOption = RUNS,
-        steps: StepsOption = None,
-        batch_size: BatchOption = None,
-        device: DeviceOption = "cpu",
-        seed: SeedOption = 1,
-        resume: ResumeOption = False,
-    ) -> None:
-        _train(networks, data, runs, steps, batch_size, device, seed, resume)
-
-
-for _name in NETWORKS:
-    _add_train_command(_name, (_name,), f"Train the {_name} network.")
-_add_train_command("all", NETWORKS, "Train all three networks in turn.")
-
-
-@train_app.command("guided")
-def train_guided_command(
+@train_app.command()
+def train_command(
+    network: NetworkArgument,
     data: DataOption,
-    pack: Annotated[str, typer.Option(help="Pack whose depth net guides: a shipped one's name, or a folder.")] = "edge",
-    runs: RunsOption = RUNS,
-    steps: StepsOption = None,
-    batch_size: BatchOption = None,
-    device: DeviceOption = "cpu",
-    seed: SeedOption = 1,
-    resume: ResumeOption = False,
+    pack: PackOption = PackName.EDGE,
+    runs: RunsOption = None,
+    real: Annotated[Path | None, typer.Option(help="Folder of real recordings that train too.")] = None,
+    taught: Annotated[Path | None, typer.Option(help="What `quadlift teach` wrote of them.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Optimiser steps; the recipe's if left out.")] = None,
+    epochs: Annotated[float | None, typer.Option(help="Passes over the data, instead of steps.")] = None,
+    batch_size: Annotated[int | None, typer.Option(help="Items a step; the recipe's if left out.")] = None,
+    learning_rate: Annotated[float | None, typer.Option(help="Peak rate; the recipe's if left out.")] = None,
+    max_minutes: Annotated[
+        float | None, typer.Option(help="Stop by then, with a checkpoint, the schedule run to its end.")
+    ] = None,
+    device: Annotated[str, typer.Option(help="torch device: cpu, cuda, ...")] = "cpu",
+    threads: Annotated[int, typer.Option(help="CPU threads of the arithmetic.")] = 1,
+    workers: Annotated[int, typer.Option(help="Batches prepared at the same time.")] = 1,
+    amp: Annotated[bool, typer.Option(help="Mixed precision (bfloat16).")] = True,
+    seed: Annotated[int, typer.Option(help="Of weights, data order and augmentation.")] = 1,
+    init: Annotated[Path | None, typer.Option(help="File or folder of weights to start from.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint.")] = False,
 ) -> None:
-    """Train the depth-guided detector beside a pack's depth net."""
-    base = GuidedRecipe().training
-    config = replace(base, device=device, seed=seed, steps=steps or base.steps, batch_size=batch_size or base.batch_size)
+    """Train networks of a pack on scenes: checkpoint, log and loss curves go to --runs."""
+    changes: dict[str, Any] = {
+        "batch_size": batch_size, "learning_rate": learning_rate, "max_minutes": max_minutes,
+        "device": device, "threads": threads, "workers": workers, "amp": amp, "seed": seed,
+    }  # fmt: skip
+    if steps is not None or epochs is not None:
+        changes |= {"steps": steps, "epochs": epochs}
+    recipe = _recipe(pack)
     try:
-        train_guided(data, pack, runs, replace(GuidedRecipe(), training=config), resume=resume)
+        names = recipe.names if network == ALL else (recipe.network(network).name,)
+        if init is not None and network == ALL:
+            raise InputError("is for one network.", field="init", remedy="Train the networks one by one.")
+        recordings = _recordings(real, taught)
+        for name in names:
+            config = _changed(recipe.network(name).training, changes)
+            changed = recipe.with_training(name, config)
+            train(changed, name, data, runs or _runs(pack), real=recordings, init=init, resume=resume)
     except QuadliftError as error:
-        console.print(f"[red]{error}[/red]")
-        raise typer.Exit(1) from None
+        raise _failed(error) from None
 
 
-@export_app.command("edge")
-def export_edge(
+@export_app.command()
+def export_command(
     data: DataOption,
-    runs: RunsOption = RUNS,
-    out: Annotated[Path, typer.Option(help="Folder of the pack.")] = Path("service/models/edge"),
+    out: Annotated[Path, typer.Option(help="Folder of the pack.")],
+    pack: PackOption = PackName.EDGE,
+    runs: RunsOption = None,
+    precision: Annotated[PrecisionName | None, typer.Option(help="Of all networks; the recipe's if left out.")] = None,
     fp32: Annotated[list[str] | None, typer.Option("--fp32", help="Keep this network in float. Repeatable.")] = None,
+    batch: Annotated[str, typer.Option(help="Images a run: 'dynamic', or a number that every run has.")] = "dynamic",
 ) -> None:
-    """Export, check against torch, quantize, score, and write the manifest."""
-    recipe = EdgeRecipe()
-    recipe = replace(recipe, int8=tuple(name for name in recipe.int8 if name not in (fp32 or ())))
+    """Export trained networks to a pack: checked against torch, measured on validation scenes, with a manifest."""
     try:
-        manifest = export(runs, data, out, recipe, console)
+        recipe = _recipe(pack)
+        keep = tuple(recipe.network(name).name for name in fp32 or ())
+        options = ExportOptions(precision.value if precision else None, keep, _batch(batch))
+        manifest = export(recipe, runs or _runs(pack), data, out, options, console)
     except QuadliftError as error:
-        console.print(f"[red]{error}[/red]")
-        raise typer.Exit(1) from None
+        raise _failed(error) from None
     size = sum((out / entry.file).stat().st_size for entry in manifest.networks.values())
     console.print(f"pack '{manifest.name}' in {out}: {size / 1e6:.1f} MB")
 
 
-@export_app.command("guided")
-def export_guided_command(
-    data: DataOption,
-    pack: Annotated[str, typer.Option(help="Pack to add the detector to: a shipped one's name, or a folder.")] = "edge",
-    runs: RunsOption = RUNS,
-    out: Annotated[Path, typer.Option(help="Folder of the pack with the detector.")] = Path("runs/guided-pack"),
-) -> None:
-    """Export the depth-guided detector, check it against torch, score it, and write the pack with it."""
-    try:
-        export_guided(runs, data, pack, out, GuidedRecipe(), console)
-    except QuadliftError as error:
-        console.print(f"[red]{error}[/red]")
-        raise typer.Exit(1) from None
+def _recipe(pack: PackName) -> PackRecipe:
+    return {PackName.EDGE: edge_recipe}[pack]()
 
 
-@export_app.callback()
-def _export() -> None:
-    """Export trained networks to a pack."""
+def _recordings(folder: Path | None, taught: Path | None) -> RealData | None:
+    if folder is None and taught is not None:
+        raise InputError("says nothing without recordings.", field="taught", remedy="Give their folder with --real.")
+    return None if folder is None else RealData(folder, taught)
+
+
+def _runs(pack: PackName) -> Path:
+    return Path("runs") / pack.value
+
+
+def _changed(training: TrainConfig, changes: dict[str, Any]) -> TrainConfig:
+    """The recipe's training with what the user gave; steps and epochs replace each other."""
+    kept = {key: value for key, value in changes.items() if value is not None or key in ("steps", "epochs")}
+    return replace(training, **kept)
+
+
+def _batch(text: str) -> int | None:
+    if text == "dynamic":
+        return None
+    if not text.isdecimal() or int(text) == 0:
+        raise InputError(f"is {text!r}.", field="batch", remedy="It must be 'dynamic' or a number above 0.")
+    return int(text)
+
+
+def _failed(error: QuadliftError) -> typer.Exit:
+    console.print(f"[red]{escape(str(error))}[/red]")
+    return typer.Exit(1)
 
 
 if __name__ == "__main__":

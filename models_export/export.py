@@ -11,10 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import onnx
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.export import Dim
 
@@ -22,6 +20,7 @@ from service.nets.canvas import ALIGN_PX
 from service.nets.pack import METADATA_KEY, Manifest, NetworkEntry, open_network
 
 OPSET = 20
+"""ONNX operator set of every exported graph; ONNX Runtime runs it since 1.17."""
 _EXAMPLE_BATCH = 2
 MAX_TILES = 60
 """Longest side of a dynamic canvas over ``ALIGN_PX``."""
@@ -68,6 +67,17 @@ def trace(
     return bytes(model.SerializeToString())
 
 
+def fixed_batch(model: bytes, size: int) -> bytes:
+    """A copy of an exported model that takes ``size`` images a run, no more and no fewer."""
+    proto = onnx.load_from_string(model)
+    symbol = proto.graph.input[0].type.tensor_type.shape.dim[0].dim_param
+    for value in [*proto.graph.input, *proto.graph.output, *proto.graph.value_info]:
+        for dim in value.type.tensor_type.shape.dim:
+            if dim.dim_param == symbol:
+                dim.dim_value = size
+    return bytes(proto.SerializeToString())
+
+
 def with_metadata(model: bytes, metadata: Mapping[str, Any]) -> bytes:
     """The model with ``metadata`` as JSON under the pack's key, replacing what was there."""
     proto = onnx.load_from_string(model)
@@ -88,6 +98,7 @@ def write_pack(
     classes: Sequence[str],
     training: Mapping[str, Any],
     scores: Mapping[str, Any],
+    licence: str = "Apache-2.0",
 ) -> Manifest:
     """Write files and manifest of a pack, after each file was opened once as the service will open it."""
     out.mkdir(parents=True, exist_ok=True)
@@ -105,7 +116,7 @@ def write_pack(
     manifest = Manifest(
         name=name,
         version=version,
-        licence="Apache-2.0",
+        licence=licence,
         classes=list(classes),
         networks=entries,
         training=dict(training),
@@ -113,11 +124,6 @@ def write_pack(
     )
     (out / "manifest.json").write_text(json.dumps(manifest.model_dump(), indent=1) + "\n", encoding="utf-8")
     return manifest
-
-
-def canvases_of(images: Sequence[NDArray[np.uint8]], batch: int = 4) -> list[NDArray[np.uint8]]:
-    """Equal-sized canvases in batches, for calibration."""
-    return [np.stack(images[i : i + batch]) for i in range(0, len(images) - batch + 1, batch)]
 
 
 def _strip_source_paths(model: onnx.ModelProto) -> None:

@@ -14,7 +14,7 @@ from models_export.data.samples import Sample
 from models_export.validate import MATCH_IOU, detector_scores, image_of
 from service.geometry.iou import iou_2d
 from service.geometry.transforms import Array, wrap_angle
-from service.nets.detector import Detections
+from service.nets.detections import Detections
 from service.nets.guided import GuidedDetections, GuidedDetector
 
 Index = NDArray[np.int64]

@@ -21,7 +21,8 @@ from service.geometry.camera import ray_azimuth
 from service.geometry.iou import iou_2d
 from service.geometry.transforms import Array, wrap_angle
 from service.nets.depth import UNBIASED, DepthNet, InverseDepth
-from service.nets.detector import Detections, Detector, box_size
+from service.nets.detections import Detections
+from service.nets.detector import Detector, box_size
 from service.nets.error_model import ErrorModel
 from service.nets.multibin import Multibin, crop_vehicles
 
@@ -189,7 +190,7 @@ def depth_scores(depth: DepthNet, samples: Sequence[Sample], matches: Sequence[M
     errors, within, readings = [], [], [np.zeros(0)]
     for sample, m in zip(samples, matches, strict=True):
         ours = depth.infer([image_of(sample)])[0]
-        truth = sample.inverse_depth[: ours.values.shape[0], : ours.values.shape[1]]
+        truth = true_map(sample, ours)
         known = truth > 0
         ratio = truth[known] / np.maximum(_aligned(ours.values[known], truth[known]), 1 / 200)
         errors.append(float(np.mean(np.abs(ratio - 1))))
@@ -203,6 +204,17 @@ def depth_scores(depth: DepthNet, samples: Sequence[Sample], matches: Sequence[M
         "bias_relative": round(bias, 4),
         "sigma_relative": round(float(np.percentile(np.abs((1 + every) / (1 + bias) - 1), _NORMAL_68)), 4),
     }
+
+
+def true_map(sample: Sample, ours: InverseDepth) -> NDArray[np.float32]:
+    """The true inverse depth (h, w) at the cells of a map, which may be coarser or finer than the sample's."""
+    stride = sample.canvas.shape[0] / sample.inverse_depth.shape[0]
+    rows, columns = (
+        np.minimum(((np.arange(ours_size) + 0.5) * ours.stride / stride).astype(np.int64), size - 1)
+        for ours_size, size in zip(ours.values.shape, sample.inverse_depth.shape, strict=True)
+    )
+    truth: NDArray[np.float32] = sample.inverse_depth[np.ix_(rows, columns)]
+    return truth
 
 
 def _aligned(ours: NDArray[np.float32], truth: NDArray[np.float32]) -> Array:

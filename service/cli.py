@@ -18,6 +18,7 @@ from rich.markup import escape
 
 from service import __version__
 from service.errors import QuadliftError
+from service.nets.providers import Provider
 
 if TYPE_CHECKING:
     import uvicorn
@@ -30,8 +31,11 @@ _HELP = {
     "demo": "Show a live four-camera intersection in the browser.",
     "feed": "Push recordings or live cameras to a running service.",
     "scenes": "Render simulated scenes for training and tests.",
+    "guided": "Train the depth-guided detector and add it to a pack.",
     "train": "Train the networks.",
     "export": "Export trained networks to an ONNX pack.",
+    "import-darknet": "Make a pack around YOLOv3 weights in a Darknet file.",
+    "import-detector": "Wrap an ONNX detector of your own into a pack.",
     "carla": "Capture scenes from a CARLA server.",
 }
 
@@ -54,6 +58,7 @@ def serve(
     port: Annotated[int | None, typer.Option(help="TCP port to listen on.")] = None,
     site: Annotated[list[Path] | None, typer.Option(help="Site file to load; may be given several times.")] = None,
     pack: Annotated[str | None, typer.Option(help="Networks to run: a shipped pack's name or a folder.")] = None,
+    provider: Annotated[Provider | None, typer.Option(help="What the networks compute on.")] = None,
     workers: Annotated[int | None, typer.Option(help="Threads that run frame sets.")] = None,
     data_dir: Annotated[Path | None, typer.Option(help="Folder that keeps the sites across restarts.")] = None,
     viewer: Annotated[bool | None, typer.Option(help="Serve the viewer page.")] = None,
@@ -63,7 +68,7 @@ def serve(
 
     given: dict[str, Any] = {
         "host": host, "port": port, "sites": tuple(site) if site else None, "pack": pack,
-        "workers": workers, "data_dir": data_dir, "viewer": viewer,
+        "provider": provider, "workers": workers, "data_dir": data_dir, "viewer": viewer,
     }  # fmt: skip
     try:
         settings = Settings(**{name: value for name, value in given.items() if value is not None})

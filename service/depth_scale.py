@@ -57,14 +57,14 @@ class DepthReadings:
         return DepthReadings(np.full(count, np.nan), np.full(count, np.nan))
 
 
-def cell_pixels(shape: tuple[int, ...], stride: int) -> Array:
+def cell_pixels(shape: tuple[int, ...], stride: float) -> Array:
     """Pixel coordinates (h, w, 2) of the centres of a map's cells."""
     x = (np.arange(shape[1]) + 0.5) * stride - 0.5
     y = (np.arange(shape[0]) + 0.5) * stride - 0.5
     return np.stack(np.meshgrid(x, y), -1)
 
 
-def ground_inverse_depth(camera: Camera, ground: Ground, shape: tuple[int, ...], stride: int) -> Array:
+def ground_inverse_depth(camera: Camera, ground: Ground, shape: tuple[int, ...], stride: float) -> Array:
     """1 / Z of the road at each cell (h, w); NaN above the horizon and outside ``NEAREST_M``..``FARTHEST_M``."""
     rays = camera.rays_world(cell_pixels(shape, stride))
     road = ground.intersect(camera.position_m, rays)

@@ -20,9 +20,10 @@ from service.geometry.boxes import Boxes, clip_extents, cut_edges
 from service.geometry.camera import Camera, UInt8Image, yaw_from_alpha
 from service.guidance import Guidance, GuidanceSettings, HardMode, View
 from service.lifting import LiftSettings, Measurements, lift
-from service.nets.canvas import canvas_size
+from service.nets.canvas import Canvases, canvas_size
 from service.nets.depth import DepthNet, InverseDepth
-from service.nets.detector import Detections, Detector, edge_sigma
+from service.nets.detections import Detections
+from service.nets.detector import NMS_IOU, SCORE_THRESHOLD, Detector, edge_sigma
 from service.nets.multibin import Multibin, MultibinEstimates, crop_vehicles
 from service.nets.pack import Pack
 from service.paper_fusion import PaperFusionSettings, fuse_paper
@@ -40,9 +41,9 @@ class PipelineSettings:
     """How boxes are lifted and fused: by maximum a posteriori and information, or as in the source paper."""
     hard_mode: HardMode = "auto"
     """Whether the depth-guided detector adds to what was lifted: in cameras whose view is hard, in all, or in none."""
-    score_threshold: float = 0.3
+    score_threshold: float = SCORE_THRESHOLD
     """2D detections of a lower score are dropped."""
-    nms_iou: float = 0.55
+    nms_iou: float = NMS_IOU
     """2D boxes that overlap a better one by more are dropped."""
     min_fused_score: float = 0.3
     """Fused boxes of a lower score are dropped."""
@@ -113,11 +114,12 @@ class Pipeline:
         with _timed(timing, "decode"):
             cameras, images, failed = self._decode(frame_set)
         with _timed(timing, "detect"):
-            found = self.detector.detect(images, score_threshold=self.settings.score_threshold, nms_iou=self.settings.nms_iou)
+            canvases = Canvases(images)
+            found = self._detect(canvases)
         with _timed(timing, "orient"):
             estimates = self._orient(images, found)
         with _timed(timing, "depth"):
-            maps = self._metric_maps(frame_set, cameras, images)
+            maps = self._metric_maps(frame_set, cameras, canvases)
             readings = self._read_depth(maps, found)
         with _timed(timing, "lift"):
             measurements = self._measurements(cameras, found, estimates, readings)
@@ -189,18 +191,23 @@ class Pipeline:
             raise next(iter(failed.values()))
         return cameras, images, failed
 
+    def _detect(self, canvases: Canvases) -> list[Detections]:
+        batches, settings = canvases.batches(self.detector.fit), self.settings
+        return self.detector.detect_on(batches, score_threshold=settings.score_threshold, nms_iou=settings.nms_iou)
+
     def _orient(self, images: list[UInt8Image], found: list[Detections]) -> MultibinEstimates:
         size = self.multibin.spec.crop_px
         crops = [crop_vehicles(image, detections.xyxy_px, size) for image, detections in zip(images, found, strict=True)]
         return self.multibin.estimate(np.concatenate(crops), np.concatenate([detections.cls for detections in found]))
 
     def _metric_maps(
-        self, frame_set: FrameSet, cameras: list[Camera], images: list[UInt8Image]
+        self, frame_set: FrameSet, cameras: list[Camera], canvases: Canvases
     ) -> list[tuple[InverseDepth, DepthScale | None]]:
         """Each image's inverse depth, and what makes it metric."""
+        maps = self.depth.infer_on(canvases.batches(self.depth.fit))
         return [
             (inverse, self._scales.update(frame_set.site.camera(camera.id), camera, frame_set.site.ground, inverse))
-            for camera, inverse in zip(cameras, self.depth.infer(images), strict=True)
+            for camera, inverse in zip(cameras, maps, strict=True)
         ]
 
     def _read_depth(self, maps: list[tuple[InverseDepth, DepthScale | None]], found: list[Detections]) -> DepthReadings:

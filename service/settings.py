@@ -10,6 +10,7 @@ from pydantic import Field, SecretStr
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.frames import FrameLimits
+from service.nets.providers import Provider
 from service.sync import SyncSettings
 
 _CGROUP_CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
@@ -39,6 +40,9 @@ class Settings(BaseSettings):
     """TCP port to listen on; 0 takes a free one."""
     pack: str = "edge"
     """Networks to run: the name of a shipped pack, or the path of a pack's folder."""
+    provider: Provider = "auto"
+    """What the networks compute on: ``cpu``, ``cuda``, ``tensorrt``, ``openvino``; ``auto`` takes CUDA, then OpenVINO, then the
+    CPU, whichever the installed onnxruntime has. One given by name must be there and must start."""
     data_dir: Path | None = None
     """Folder that keeps the sites across restarts. Unset: sites live in memory only."""
     sites: tuple[Path, ...] = ()

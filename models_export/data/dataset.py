@@ -1,7 +1,7 @@
 """Scenes on disk: a folder of scene folders, each a site, world boxes with identities, and per camera KITTI files and depth.
 
 <scene>/site.json                           the cameras in the world
-<scene>/scene.json                          seed, world, rate_hz, steps, generator
+<scene>/scene.json                          seed, world, rate_hz, steps, condition, generator
 <scene>/boxes/000000.json                   world boxes of one step
 <scene>/cameras/<camera>/image_2/000000.jpg
 <scene>/cameras/<camera>/label_2/000000.txt KITTI labels, for tools that read them
@@ -27,6 +27,7 @@ from service.site import Site, load_site
 
 DEPTH_UNITS_PER_M = 256.0
 MAX_DEPTH_M = 255.0
+UNKNOWN_CONDITION = "unknown"
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +99,8 @@ class Scene:
     rate_hz: float
     world: str
     seed: int
+    condition: str = UNKNOWN_CONDITION
+    """Light and weather: day, night, fog, ..."""
 
     @cached_property
     def camera_ids(self) -> tuple[str, ...]:
@@ -143,11 +146,12 @@ def open_scene(path: Path) -> Scene:
     try:
         steps, rate_hz = int(document["steps"]), float(document["rate_hz"])
         world, seed = str(document["world"]), int(document["seed"])
+        condition = str(document.get("condition", UNKNOWN_CONDITION))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"not a scene: {error!r}.", field=str(path / "scene.json"), remedy="Render the scene again."
         ) from error
-    return Scene(path, load_site(path / "site.json"), steps, rate_hz, world, seed)
+    return Scene(path, load_site(path / "site.json"), steps, rate_hz, world, seed, condition)
 
 
 def list_scenes(root: Path) -> list[Path]:

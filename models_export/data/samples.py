@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from models_export.data.dataset import Scene, list_scenes, open_scene
+from models_export.data.dataset import UNKNOWN_CONDITION, Scene, list_scenes, open_scene
+from models_export.data.detection import MIN_SIDE_PX, VEHICLES, VehicleSample, class_columns
 from service.errors import InputError
 from service.frames import decode
 from service.geometry.boxes import clip_extents, project_extents
@@ -19,12 +20,10 @@ from service.geometry.ground import Ground
 from service.geometry.transforms import Array, wrap_angle
 from service.nets.canvas import to_canvas
 
-VEHICLES = ("car", "van", "truck", "bus")
-"""Classes that resemble each other: one that is not asked for is neither positive nor negative. Others are background."""
+SIMULATED = "simulated"
+"""The first part of the source of a scene's frames."""
 MIN_VISIBLE = 0.3
 """Vehicles of which less is visible are neither positives nor negatives."""
-MIN_SIDE_PX = 5.0
-"""Vehicles whose 2D box is smaller in the decoded image are neither positives nor negatives."""
 MAX_TRUNCATED = 0.7
 """Vehicles of which more lies outside the image are neither positives nor negatives."""
 MAX_DEPTH_M = 150.0
@@ -34,25 +33,9 @@ VALIDATION_EVERY = 10
 
 
 @dataclass(frozen=True, eq=False)
-class Sample:
-    """One camera's frame."""
+class Sample(VehicleSample):
+    """One camera's frame of a scene, where everything is known."""
 
-    canvas: NDArray[np.uint8]
-    """(H, W, 3) RGB; the image lies in its upper left corner."""
-    image_size: tuple[int, int]
-    """Width and height of the image inside the canvas, px."""
-    camera: Camera
-    """The camera at the image's size."""
-    xyxy_px: Array
-    """(N, 4) extents of the projected boxes, clipped to the image."""
-    ignore: NDArray[np.bool_]
-    """(N,) vehicles that a detector is neither asked for nor blamed for."""
-    cls: NDArray[np.int64]
-    """(N,) class indices."""
-    dims_lwh: Array
-    """(N, 3) metres."""
-    alpha: Array
-    """(N,) heading relative to the ray through the 2D box's centre, radians."""
     visible: Array
     """(N,) visible fraction."""
     truncated: Array
@@ -63,6 +46,13 @@ class Sample:
     """The scene's road."""
     inverse_depth: NDArray[np.float32]
     """(h, w) 1 / metres at the depth net's stride; 0 where the depth is unknown."""
+    weather: str = UNKNOWN_CONDITION
+    """Light and weather of the scene: day, night, fog, ..."""
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """What validation tells frames apart by."""
+        return {"camera": self.camera.id, "weather": self.weather}
 
 
 def split_scenes(roots: Iterable[Path]) -> tuple[list[Path], list[Path]]:
@@ -97,20 +87,22 @@ def _load_sample(
     image = decode(scene.frame_bytes(camera.id, step), camera, max_width)
     scaled = camera.scaled(image.shape[1], image.shape[0])
     extents, in_front = project_extents(scaled, truth.center, truth.dims_lwh, truth.yaw)
-    kinds = np.array([name.lower() for name in truth.classes])
+    kinds = np.array(truth.kinds)
     seen = in_front & (truth.visible[:, camera_index] > 0) & (np.isin(kinds, classes) | np.isin(kinds, VEHICLES))
     xyxy = clip_extents(scaled, extents[seen])
     visible, truncated = truth.visible[seen, camera_index], truth.truncated[seen, camera_index]
     sides = xyxy[:, 2:] - xyxy[:, :2]
-    known = np.isin(kinds[seen], classes)
-    ignore = ~known | (visible < MIN_VISIBLE) | (sides.min(1, initial=np.inf) < MIN_SIDE_PX) | (truncated > MAX_TRUNCATED)
+    cls, known, unwanted = class_columns(kinds[seen].tolist(), classes)
+    ignore = unwanted | (visible < MIN_VISIBLE) | (sides.min(1, initial=np.inf) < MIN_SIDE_PX) | (truncated > MAX_TRUNCATED)
     return Sample(
         canvas=to_canvas(image),
         image_size=(image.shape[1], image.shape[0]),
         camera=scaled,
         xyxy_px=xyxy,
         ignore=ignore,
-        cls=np.array([classes.index(kind) if kind in classes else 0 for kind in kinds[seen]], dtype=np.int64),
+        cls=cls,
+        class_known=known,
+        source=f"{SIMULATED}/{scene.world}",
         dims_lwh=truth.dims_lwh[seen],
         alpha=wrap_angle(truth.yaw[seen] - ray_azimuth(scaled, (xyxy[:, :2] + xyxy[:, 2:]) / 2)),
         visible=visible,
@@ -118,6 +110,7 @@ def _load_sample(
         center=truth.center[seen],
         ground=scene.site.ground,
         inverse_depth=_inverse_depth(scene.depth(camera.id, step), to_canvas(image).shape[:2], image.shape[:2], depth_stride),
+        weather=scene.condition,
     )
 
 

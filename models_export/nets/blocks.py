@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 PIXEL_SCALE, PIXEL_OFFSET = 1.0 / 127.5, 1.0
 """Networks see ``pixel * PIXEL_SCALE - PIXEL_OFFSET``."""
+_PRIOR_OBJECTNESS_LOGIT = -4.6
 
 
 class Normalise(nn.Module):
@@ -41,12 +42,15 @@ def stage(cin: int, cout: int, residuals: int) -> nn.Sequential:
     return nn.Sequential(conv(cin, cout, 3, 2), *(Residual(cout) for _ in range(residuals)))
 
 
+def start_with_rare_objects(bias: Tensor, fields: int) -> None:
+    """Set the objectness of a head's bias (A * fields,) low in place.
+
+    Vehicles cover a few cells of a few thousand: otherwise the first steps only unlearn them.
+    """
+    with torch.no_grad():
+        bias.view(-1, fields)[:, 4] = _PRIOR_OBJECTNESS_LOGIT
+
+
 def parameter_count(net: nn.Module) -> int:
     """Number of trained values."""
     return sum(p.numel() for p in net.parameters())
-
-
-def seed_everything(seed: int) -> torch.Generator:
-    """Seed torch and return a generator for data order."""
-    torch.manual_seed(seed)
-    return torch.Generator().manual_seed(seed)

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor, nn
 
-from models_export.nets.blocks import Normalise, conv, stage
-from service.nets.detector import BOX_FIELDS
-
-# Vehicles cover a few cells of a few thousand: start the objectness low, or the first steps only unlearn it.
-_PRIOR_OBJECTNESS_LOGIT = -4.6
+from models_export.nets.blocks import Normalise, conv, stage, start_with_rare_objects
+from service.nets.decoding import BOX_FIELDS
 
 
 @dataclass(frozen=True)
@@ -56,14 +52,8 @@ class EdgeDetector(nn.Module):
         self.merge8 = conv(neck, neck)
         out = len(config.anchors_px[0]) * (BOX_FIELDS + len(config.classes))
         self.heads = nn.ModuleList(nn.Sequential(conv(neck, width), nn.Conv2d(width, out, 1)) for width in (neck, 96, 128))
-        self._start_with_rare_objects()
-
-    def _start_with_rare_objects(self) -> None:
-        fields = BOX_FIELDS + len(self.config.classes)
         for head in self.heads:
-            bias = head[-1].bias  # type: ignore[index]
-            with torch.no_grad():
-                bias.view(-1, fields)[:, 4] = _PRIOR_OBJECTNESS_LOGIT
+            start_with_rare_objects(head[-1].bias, BOX_FIELDS + len(config.classes))  # type: ignore[index]
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Heads at strides 8, 16, 32; H and W are multiples of 32."""

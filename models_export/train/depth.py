@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from models_export.data.augment import AugmentConfig, flip_horizontally, photometric
+from models_export.data.augment import NO_AUGMENT, AugmentConfig, flip_horizontally, photometric
 from models_export.data.samples import Sample
 from models_export.losses import depth_loss
 from models_export.nets.depth import DepthConfig, EdgeDepth
-from models_export.train.loop import Batch
+from models_export.train.task import Batch, ParameterGroup, decayed_groups, draw_uniform
 
 
 class DepthTask:
@@ -31,10 +33,31 @@ class DepthTask:
         """Configuration of network, data and augmentation."""
         return {"net": asdict(self.config), "augment": asdict(self.augment), "samples": len(self.samples)}
 
-    def batch(self, rng: np.random.Generator, size: int) -> Batch:
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def held_out(self, samples: list[Sample]) -> DepthTask:
+        """The same network and configuration over other samples, which are not augmented: for validation."""
+        other = copy(self)
+        other.samples, other.augment = samples, NO_AUGMENT
+        return other
+
+    def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.int64]:
+        """Every frame is as likely as the others."""
+        return draw_uniform(rng, len(self), size)
+
+    def labels(self, index: int) -> dict[str, str]:
+        """Camera and weather of a frame."""
+        return self.samples[index].labels
+
+    def parameter_groups(self, net: nn.Module) -> list[ParameterGroup]:
+        """All of the network at one pace."""
+        return decayed_groups(net)
+
+    def batch(self, indices: NDArray[np.int64], rng: np.random.Generator) -> Batch:
         """Images (B, H, W, 3) uint8, inverse depth (B, h, w) in 1 / metres, 0 where unknown."""
         images, targets = [], []
-        for index in rng.integers(len(self.samples), size=size):
+        for index in indices:
             sample = self.samples[index]
             image, target = sample.canvas, sample.inverse_depth
             if rng.random() < self.augment.flip:

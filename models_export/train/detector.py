@@ -2,50 +2,99 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import asdict, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from models_export.data.augment import AugmentConfig, flip_horizontally, photometric, rescale
-from models_export.data.samples import MIN_SIDE_PX, Sample
+from models_export.data.augment import NO_AUGMENT, AugmentConfig
+from models_export.data.detection import DetectionSample
+from models_export.data.mix import MixConfig, draw_by_odds, draw_odds
 from models_export.losses import ciou
 from models_export.nets.detector import DetectorConfig, EdgeDetector
-from models_export.train.loop import Batch
+from models_export.train.detector_pictures import UNKNOWN_CLASS, canvas_of, stacked, strips_on
+from models_export.train.task import Batch, ParameterGroup, decayed_groups
 from service.geometry.transforms import Array
-from service.nets.detector import BOX_FIELDS
+from service.nets.decoding import BOX_FIELDS
 
 MAX_RATIO = 4.0
 """An anchor answers for a box whose sides differ from its own by less than this factor: what (2 sigmoid)^2 can reach."""
 SCALE_BALANCE = (4.0, 1.0, 0.4)
 """Weights of the objectness of the strides: fine grids hold more cells, and smaller vehicles."""
+_ANCHOR_DRAWS = 4000
 BOX_WEIGHT, OBJECT_WEIGHT, CLASS_WEIGHT = 0.05, 1.0, 0.2
 
 
 class DetectorTask:
-    """The detector with its training samples."""
+    """The detector with its training samples, which may be of several data sets and sizes."""
 
     name = "detector"
 
-    def __init__(self, samples: list[Sample], config: DetectorConfig, augment: AugmentConfig | None = None) -> None:
+    def __init__(
+        self,
+        samples: Sequence[DetectionSample],
+        config: DetectorConfig,
+        augment: AugmentConfig | None = None,
+        mix: MixConfig | None = None,
+    ) -> None:
         self.samples = samples
-        self.config = replace(config, anchors_px=anchors_of(samples, config.strides))
+        self.mix = mix or MixConfig()
+        self.odds = draw_odds([sample.source for sample in samples], self.mix)
+        self.canvas_px: tuple[int, int] | None = canvas_of(samples)
+        drawn = self.draw(np.random.default_rng(0), _ANCHOR_DRAWS)
+        self.config = replace(config, anchors_px=anchors_of([samples[i] for i in drawn], config.strides))
         self.augment = augment or AugmentConfig()
         self.net = EdgeDetector(self.config)
 
     def describe(self) -> dict[str, Any]:
         """Configuration of network, data and augmentation."""
-        return {"net": asdict(self.config), "augment": asdict(self.augment), "samples": len(self.samples)}
+        sources = Counter(sample.source.split("/")[0] for sample in self.samples)
+        return {
+            "net": asdict(self.config),
+            "augment": asdict(self.augment),
+            "samples": dict(sorted(sources.items())),
+            "mix": asdict(self.mix),
+        }
 
-    def batch(self, rng: np.random.Generator, size: int) -> Batch:
-        """Images (B, H, W, 3) uint8; targets (T, 7): image, class, x0, y0, x1, y1 (px), ignore."""
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def held_out(self, samples: Sequence[DetectionSample]) -> DetectorTask:
+        """The same network and configuration over other samples, as they are, each on its own canvas: for validation."""
+        other = copy(self)
+        other.samples, other.augment, other.canvas_px = samples, NO_AUGMENT, None
+        other.odds = draw_odds([sample.source for sample in samples], self.mix)
+        return other
+
+    def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.int64]:
+        """Samples by the shares of the mix."""
+        return draw_by_odds(rng, self.odds, size)
+
+    def labels(self, index: int) -> dict[str, str]:
+        """Camera and weather of a simulated frame, source of a real one."""
+        return self.samples[index].labels
+
+    def parameter_groups(self, net: nn.Module) -> list[ParameterGroup]:
+        """All of the network at one pace."""
+        return decayed_groups(net)
+
+    def batch(self, indices: NDArray[np.int64], rng: np.random.Generator) -> Batch:
+        """Images (B, H, W, 3) uint8; targets (T, 7): image, class or -1, x0, y0, x1, y1 (px), ignore.
+
+        Where a canvas takes more than one picture, others of the same data set and size fill it.
+        """
         images, targets = [], []
-        for row, index in enumerate(rng.integers(len(self.samples), size=size)):
-            image, boxes = self._augmented(self.samples[index], rng)
+        for row, index in enumerate(indices):
+            image, boxes = self._picture(int(index), rng)
             images.append(image)
             targets.append(np.concatenate([np.full((len(boxes), 1), float(row)), boxes], 1))
         return {
@@ -57,24 +106,29 @@ class DetectorTask:
         """Box, objectness and class losses and their weighted sum."""
         return detector_loss([head.float() for head in net(batch["images"])], batch["targets"], self.config)
 
-    def _augmented(self, sample: Sample, rng: np.random.Generator) -> tuple[np.ndarray, Array]:
-        image, xyxy = sample.canvas, sample.xyxy_px
-        if rng.random() < self.augment.flip:
-            image, xyxy = flip_horizontally(image, xyxy, sample.image_size[0])
-        if rng.random() < self.augment.geometric:
-            image, xyxy = rescale(image, xyxy, rng, self.augment)
-        height, width = image.shape[:2]
-        clipped = np.clip(xyxy, 0, np.array([width - 1, height - 1] * 2))
-        sides, full = clipped[:, 2:] - clipped[:, :2], np.maximum(xyxy[:, 2:] - xyxy[:, :2], 1e-6)
-        kept = np.prod(sides, axis=1) / np.prod(full, axis=1)
-        ignore = sample.ignore | (sides.min(1, initial=np.inf) < MIN_SIDE_PX) | (kept < 0.3)
-        present = sides.min(1, initial=np.inf) > 1
-        rows = np.concatenate([sample.cls[:, None], clipped, ignore[:, None]], 1)
-        return photometric(image, rng, self.augment), rows[present]
+    def _picture(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, Array]:
+        sample = self.samples[index]
+        if self.canvas_px is None:
+            return stacked([sample], (sample.canvas.shape[1], sample.canvas.shape[0]), rng, self.augment)
+        strips = strips_on(self.canvas_px, sample)
+        others = rng.choice(self._like[_likeness(sample)], size=strips - 1)
+        return stacked([sample, *(self.samples[i] for i in others)], self.canvas_px, rng, self.augment)
+
+    @cached_property
+    def _like(self) -> dict[tuple[str, int], list[int]]:
+        """Samples by data set and height."""
+        groups: dict[tuple[str, int], list[int]] = {}
+        for index, sample in enumerate(self.samples):
+            groups.setdefault(_likeness(sample), []).append(index)
+        return groups
+
+
+def _likeness(sample: DetectionSample) -> tuple[str, int]:
+    return sample.source.split("/")[0], sample.canvas.shape[0]
 
 
 def anchors_of(
-    samples: list[Sample], strides: tuple[int, ...], per_scale: int = 3
+    samples: Sequence[DetectionSample], strides: tuple[int, ...], per_scale: int = 3
 ) -> tuple[tuple[tuple[float, float], ...], ...]:
     """Anchors (width, height), px, by k-means over the logarithms of the boxes' sides: smallest for the finest stride.
 
@@ -90,9 +144,9 @@ def anchors_of(
 def detector_loss(heads: list[Tensor], targets: Tensor, config: DetectorConfig) -> dict[str, Tensor]:
     """YOLO's loss over all scales.
 
-    heads: (B, A * (5 + C), h, w) logits a stride. targets (T, 7): image, class, x0, y0, x1, y1 (px), ignore. Complete IoU
-    for boxes; binary cross entropy for objectness, whose target is the IoU reached; cells centred in ignored boxes are
-    left out of the objectness unless they answer for a vehicle.
+    heads: (B, A * (5 + C), h, w) logits a stride. targets (T, 7): image, class or -1, x0, y0, x1, y1 (px), ignore. Complete
+    IoU for boxes; binary cross entropy for objectness, whose target is the IoU reached; cells centred in ignored boxes are
+    left out of the objectness unless they answer for a vehicle; targets of unknown class are left out of the class's loss.
     """
     positives = targets[targets[:, 6] == 0]
     ignored = targets[targets[:, 6] != 0]
@@ -107,13 +161,20 @@ def detector_loss(heads: list[Tensor], targets: Tensor, config: DetectorConfig) 
             overlap = ciou(decode(cells, index, stride, head.new_tensor(anchors)), truth[:, 2:6])
             box = box + (1 - overlap).mean()
             wanted[index] = overlap.detach().clamp(min=0).to(wanted.dtype)
-            one_hot = F.one_hot(truth[:, 1].long(), len(config.classes)).to(cells.dtype)
-            classes = classes + F.binary_cross_entropy_with_logits(cells[:, BOX_FIELDS:], one_hot)
+            classes = classes + _class_loss(cells[:, BOX_FIELDS:], truth[:, 1].long())
         blamed = ~_covered(ignored, grid.shape, stride, grid.device) | (wanted > 0)
         losses = F.binary_cross_entropy_with_logits(grid[..., 4], wanted, reduction="none")
         objectness = objectness + balance * (losses * blamed).mean()
     total = BOX_WEIGHT * box + OBJECT_WEIGHT * objectness + CLASS_WEIGHT * classes
     return {"total": total, "box": box, "objectness": objectness, "classes": classes}
+
+
+def _class_loss(logits: Tensor, cls: Tensor) -> Tensor:
+    """Mean binary cross entropy of logits (P, C) over the targets (P,) whose class is known; 0 when there are none."""
+    known = cls != UNKNOWN_CLASS
+    one_hot = F.one_hot(cls.clamp(min=0), logits.shape[1]).to(logits.dtype)
+    losses = F.binary_cross_entropy_with_logits(logits, one_hot, reduction="none").mean(1)
+    return (losses * known).sum() / known.sum().clamp(min=1)
 
 
 def assign(targets: Tensor, grid_shape: tuple[int, int], stride: int, anchors: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
@@ -144,7 +205,7 @@ def assign(targets: Tensor, grid_shape: tuple[int, int], stride: int, anchors: T
 
 
 def decode(cells: Tensor, index: tuple[Tensor, ...], stride: int, anchors: Tensor) -> Tensor:
-    """Boxes xyxy (P, 4) in px of cells (P, 5 + C) of logits: as ``service.nets.detector.decode_heads``, with gradients."""
+    """Boxes xyxy (P, 4) in px of cells (P, 5 + C) of logits: as ``service.nets.decoding.decode_heads``, with gradients."""
     probability = cells.sigmoid()
     place = torch.stack([index[3], index[2]], 1)
     center = (2 * probability[:, :2] - 0.5 + place) * stride - 0.5

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from models_export.data.augment import AugmentConfig, photometric
-from models_export.data.samples import Sample
+from models_export.data.augment import NO_AUGMENT, AugmentConfig, photometric
+from models_export.data.detection import VehicleSample
 from models_export.losses import multibin_loss
 from models_export.nets.multibin import EdgeMultibin, MultibinConfig
-from models_export.train.loop import Batch
+from models_export.train.task import Batch, ParameterGroup, decayed_groups, draw_uniform
 from service.geometry.camera import ray_azimuth
 from service.geometry.transforms import Array, wrap_angle
 from service.nets.multibin import crop_vehicles
@@ -27,9 +30,9 @@ class MultibinTask:
 
     name = "multibin"
 
-    def __init__(self, samples: list[Sample], config: MultibinConfig, augment: AugmentConfig | None = None) -> None:
+    def __init__(self, samples: Sequence[VehicleSample], config: MultibinConfig, augment: AugmentConfig | None = None) -> None:
         self.samples = samples
-        self.vehicles = np.array([(i, j) for i, s in enumerate(samples) for j in np.nonzero(~s.ignore)[0]], dtype=np.int64)
+        self.vehicles = vehicles_of(samples)
         self.config = replace(config, mean_dims_lwh=mean_dims(samples, len(config.classes)))
         self.augment = augment or AugmentConfig()
         self.net = EdgeMultibin(self.config)
@@ -38,11 +41,33 @@ class MultibinTask:
         """Configuration of network, data and augmentation."""
         return {"net": asdict(self.config), "augment": asdict(self.augment), "vehicles": len(self.vehicles)}
 
-    def batch(self, rng: np.random.Generator, size: int) -> Batch:
+    def __len__(self) -> int:
+        return len(self.vehicles)
+
+    def held_out(self, samples: Sequence[VehicleSample]) -> MultibinTask:
+        """The same network and configuration over other samples, which are not augmented: for validation."""
+        other = copy(self)
+        other.samples, other.augment = samples, NO_AUGMENT
+        other.vehicles = vehicles_of(samples)
+        return other
+
+    def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.int64]:
+        """Every vehicle is as likely as the others."""
+        return draw_uniform(rng, len(self), size)
+
+    def labels(self, index: int) -> dict[str, str]:
+        """Camera and weather of a vehicle's frame."""
+        return self.samples[self.vehicles[index, 0]].labels
+
+    def parameter_groups(self, net: nn.Module) -> list[ParameterGroup]:
+        """All of the network at one pace."""
+        return decayed_groups(net)
+
+    def batch(self, indices: NDArray[np.int64], rng: np.random.Generator) -> Batch:
         """Crops (N, S, S, 3) uint8, alpha (N,), size residuals (N, 3) metres."""
         crops, alphas, residuals = [], [], []
         means = np.array(self.config.mean_dims_lwh)
-        for sample_index, row in self.vehicles[rng.integers(len(self.vehicles), size=size)]:
+        for sample_index, row in self.vehicles[indices]:
             sample = self.samples[sample_index]
             crop, alpha = _jittered(sample, row, rng, self.config.crop_px)
             if rng.random() < self.augment.flip:
@@ -65,7 +90,13 @@ class MultibinTask:
         )
 
 
-def mean_dims(samples: list[Sample], classes: int) -> tuple[tuple[float, float, float], ...]:
+def vehicles_of(samples: Sequence[VehicleSample]) -> NDArray[np.int64]:
+    """(V, 2) sample and row of every vehicle that counts and whose class is known."""
+    found = [(i, j) for i, s in enumerate(samples) for j in np.flatnonzero(~s.ignore & s.class_known)]
+    return np.array(found, dtype=np.int64).reshape(-1, 2)
+
+
+def mean_dims(samples: Sequence[VehicleSample], classes: int) -> tuple[tuple[float, float, float], ...]:
     """Mean length, width, height of each class's vehicles, metres; a class without vehicles gets the mean of all."""
     dims = np.concatenate([s.dims_lwh[~s.ignore] for s in samples])
     cls = np.concatenate([s.cls[~s.ignore] for s in samples])
@@ -73,7 +104,7 @@ def mean_dims(samples: list[Sample], classes: int) -> tuple[tuple[float, float, 
     return tuple((float(m[0]), float(m[1]), float(m[2])) for m in (np.round(r.mean(0), 4) for r in rows))
 
 
-def _jittered(sample: Sample, row: int, rng: np.random.Generator, crop_px: int) -> tuple[np.ndarray, float]:
+def _jittered(sample: VehicleSample, row: int, rng: np.random.Generator, crop_px: int) -> tuple[np.ndarray, float]:
     """A crop around a jittered box, and alpha about the jittered centre's ray."""
     xyxy = sample.xyxy_px[row]
     sides = np.tile(xyxy[2:] - xyxy[:2], 2)

@@ -95,14 +95,14 @@ def create_app(
 
 
 def default_pipeline(settings: Settings) -> FrameSetRunner:
-    """The service's own pipeline on the pack that the settings name. Raises PackError."""
+    """The service's own pipeline on the pack that the settings name. Raises PackError or InputError."""
     from service.nets.pack import load_pack
     from service.pipeline import Pipeline, PipelineSettings
 
     options = PipelineSettings(hard_mode=settings.hard_mode)
     if (threshold := settings.score_threshold) is not None:
         options = replace(options, score_threshold=threshold, min_fused_score=threshold)
-    return Pipeline(load_pack(settings.pack, intra_op_threads=1), options)
+    return Pipeline(load_pack(settings.pack, provider=settings.provider), options)
 
 
 def open_store(settings: Settings) -> SitesStore:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import PackError
-from service.nets.canvas import batches
+from service.nets.canvas import CanvasBatch, InputFit, Placement
 from service.nets.pack import Network
 
 
@@ -19,8 +19,8 @@ class InverseDepth:
 
     values: NDArray[np.float32]
     """(h, w), row and column (i, j) at pixel ((j + 0.5) * stride - 0.5, (i + 0.5) * stride - 0.5) of the image."""
-    stride: int
-    """Pixels of the image a cell."""
+    stride: float
+    """Pixels of the image a cell; not whole where the image was scaled to the net's size."""
 
 
 @dataclass(frozen=True)
@@ -39,24 +39,36 @@ UNBIASED = ReadingError(0.0, 0.0)
 class DepthNet:
     """The depth net of a pack.
 
-    ``stride`` is the image's pixels a cell; ``reading`` how far off readings in detected boxes are.
+    ``stride`` is the canvas' pixels a cell; ``reading`` how far off readings in detected boxes are; ``fit`` what the net
+    takes in.
     """
 
     def __init__(self, network: Network) -> None:
         try:
             self.stride = int(network.metadata["stride"])
             self.reading = ReadingError(float(network.metadata["bias_relative"]), float(network.metadata["sigma_relative"]))
+            self.fit = InputFit.from_metadata(network.metadata.get("fit"))
+            if self.fit.place != "corner":
+                # The cells of a centred image would begin within a cell.
+                raise ValueError("the image of a depth net lies in the corner of its canvas")
         except (KeyError, TypeError, ValueError) as error:
             raise PackError(f"metadata is incomplete: {error!r}.", field="depth", remedy="Export the pack again.") from error
         self.network = network
 
     def infer(self, images: Sequence[NDArray[np.uint8]]) -> list[InverseDepth]:
         """Inverse depth of images (H, W, 3) RGB uint8, which may differ in size; cells of the padding are cut off."""
-        results: list[InverseDepth | None] = [None] * len(images)
-        for members, canvases in batches(images):
-            (maps,) = self.network.run(canvases)
-            for row, member in enumerate(members):
-                height, width = images[member].shape[:2]
-                values = maps[row, : -(-height // self.stride), : -(-width // self.stride)]
-                results[member] = InverseDepth(values, self.stride)
-        return [result for result in results if result is not None]
+        return self.infer_on(self.fit.batches(images))
+
+    def infer_on(self, batches: Sequence[CanvasBatch]) -> list[InverseDepth]:
+        """:meth:`infer` on canvases that were made with ``fit``; one result an image, in the images' order."""
+        results: dict[int, InverseDepth] = {}
+        for batch in batches:
+            (maps,) = self.network.run(batch.pixels)
+            for member, values, placement in zip(batch.members, maps, batch.placements, strict=True):
+                results[member] = self._cut(values, placement)
+        return [results[member] for member in sorted(results)]
+
+    def _cut(self, values: NDArray[np.float32], placement: Placement) -> InverseDepth:
+        width, height = placement.size_px
+        cells = values[: -(-height // self.stride), : -(-width // self.stride)]
+        return InverseDepth(cells, self.stride / placement.scale)

@@ -1,67 +1,23 @@
-"""The one-stage 2D detector: canvases in, 2D boxes out. The decoding is YOLO's, from anchors in the ONNX metadata."""
+"""The 2D detector of a pack, of any output format: images in, 2D boxes out."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from service.errors import PackError
 from service.geometry.transforms import Array
-from service.nets.canvas import batches
-from service.nets.error_model import ErrorModel
+from service.nets.canvas import CanvasBatch, InputFit
+from service.nets.decoding import decode_heads
+from service.nets.detections import Detections, suppress
+from service.nets.detector_spec import DetectorSpec
 from service.nets.pack import Network
 
-MAX_CANDIDATES = 300
-"""Boxes of one image that enter non-maximum suppression, best first."""
-BOX_FIELDS = 5
-"""Channels of an anchor before its class logits: x, y, w, h, objectness."""
-
-
-@dataclass(frozen=True, eq=False)
-class DetectorSpec:
-    """What the ONNX metadata says of a detector."""
-
-    classes: tuple[str, ...]
-    strides: tuple[int, ...]
-    anchors_px: tuple[tuple[tuple[float, float], ...], ...]
-    """Per stride, (width, height) of each anchor in px."""
-    max_width: int
-    """Images are decoded to at most this width, px."""
-    sigma_edge_px: ErrorModel
-    """Of each edge of a box, px."""
-
-    @staticmethod
-    def from_metadata(metadata: dict[str, object]) -> DetectorSpec:
-        """Read the metadata of an ONNX file. Raises PackError naming what is missing."""
-        try:
-            return DetectorSpec(
-                classes=tuple(metadata["classes"]),  # type: ignore[arg-type]
-                strides=tuple(metadata["strides"]),  # type: ignore[arg-type]
-                anchors_px=tuple(tuple((float(w), float(h)) for w, h in scale) for scale in metadata["anchors_px"]),  # type: ignore[attr-defined]
-                max_width=int(metadata["max_width"]),  # type: ignore[call-overload]
-                sigma_edge_px=ErrorModel.from_metadata(metadata["sigma_edge_px"]),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise PackError(f"metadata is incomplete: {error!r}.", field="detector", remedy="Export the pack again.") from error
-
-
-@dataclass(frozen=True, eq=False)
-class Detections:
-    """2D boxes of one image, best first."""
-
-    xyxy_px: Array
-    """(N, 4) in the pixels of the image given to the detector, not clipped."""
-    score: Array
-    """(N,) in 0..1."""
-    cls: NDArray[np.int64]
-    """(N,) indices into the classes."""
-
-    def __len__(self) -> int:
-        return len(self.score)
+SCORE_THRESHOLD = 0.3
+"""Boxes of a lower score are dropped."""
+NMS_IOU = 0.55
+"""Boxes that overlap a better one by more are dropped."""
 
 
 class Detector:
@@ -71,57 +27,29 @@ class Detector:
         self.spec = DetectorSpec.from_metadata(network.metadata)
         self.network = network
 
+    @property
+    def fit(self) -> InputFit:
+        """What the network takes in."""
+        return self.spec.fit
+
     def detect(
-        self, images: Sequence[NDArray[np.uint8]], *, score_threshold: float = 0.3, nms_iou: float = 0.55
+        self, images: Sequence[NDArray[np.uint8]], *, score_threshold: float = SCORE_THRESHOLD, nms_iou: float = NMS_IOU
     ) -> list[Detections]:
         """2D boxes in images (H, W, 3) RGB uint8, which may differ in size; one result an image."""
-        results: list[Detections | None] = [None] * len(images)
-        for members, canvases in batches(images):
-            heads = self.network.run(canvases)
-            for row, member in enumerate(members):
-                raw = decode_heads([head[row] for head in heads], self.spec, score_threshold)
-                results[member] = suppress(raw, nms_iou)
-        return [result for result in results if result is not None]
+        return self.detect_on(self.fit.batches(images), score_threshold=score_threshold, nms_iou=nms_iou)
 
-
-def decode_heads(heads: Sequence[NDArray[np.float32]], spec: DetectorSpec, score_threshold: float) -> Detections:
-    """Boxes of one image above a score, before suppression.
-
-    heads: one array (A * (5 + C), h, w) of logits a stride. Per anchor: centre = (2 sigmoid(t) - 0.5 + cell) * stride,
-    size = (2 sigmoid(t))^2 * anchor, score = sigmoid(objectness) * sigmoid(class): YOLOv3's decoding, with its
-    exponential replaced by a bounded square so that no logit overflows, and centres free to reach into the next cell.
-    """
-    boxes, scores, classes = [], [], []
-    # A score is at most its objectness: compare logits first, decode few.
-    logit_threshold = np.log(score_threshold / (1 - score_threshold))
-    for head, stride, anchors in zip(heads, spec.strides, spec.anchors_px, strict=True):
-        fields = BOX_FIELDS + len(spec.classes)
-        grid = head.reshape(len(anchors), fields, *head.shape[-2:])
-        anchor, row, column = np.nonzero(grid[:, 4] > logit_threshold)
-        logits = grid[anchor, :, row, column].astype(np.float64)
-        probability = 1.0 / (1.0 + np.exp(-logits))
-        cell = np.stack([column, row], -1)
-        # Pixel centres lie at integers, so the centre of cell 0 is at (stride - 1) / 2.
-        center = (2.0 * probability[:, :2] - 0.5 + cell) * stride - 0.5
-        half = 0.5 * (2.0 * probability[:, 2:4]) ** 2 * np.asarray(anchors, dtype=np.float64)[anchor]
-        cls = probability[:, BOX_FIELDS:].argmax(1)
-        boxes.append(np.concatenate([center - half, center + half], 1))
-        scores.append(probability[:, 4] * probability[np.arange(len(cls)), BOX_FIELDS + cls])
-        classes.append(cls)
-    xyxy, score, cls = np.concatenate(boxes), np.concatenate(scores), np.concatenate(classes)
-    keep = np.nonzero(score > score_threshold)[0]
-    keep = keep[np.argsort(-score[keep], kind="stable")][:MAX_CANDIDATES]
-    return Detections(xyxy[keep], score[keep], cls[keep])
-
-
-def suppress(detections: Detections, nms_iou: float) -> Detections:
-    """Greedy non-maximum suppression over all classes together: one place holds one vehicle."""
-    if len(detections) == 0:
-        return detections
-    xywh = detections.xyxy_px.copy()
-    xywh[:, 2:] -= xywh[:, :2]
-    keep = np.asarray(cv2.dnn.NMSBoxes(xywh.tolist(), detections.score.tolist(), 0.0, nms_iou), dtype=np.int64).reshape(-1)
-    return Detections(detections.xyxy_px[keep], detections.score[keep], detections.cls[keep])
+    def detect_on(
+        self, batches: Sequence[CanvasBatch], *, score_threshold: float = SCORE_THRESHOLD, nms_iou: float = NMS_IOU
+    ) -> list[Detections]:
+        """:meth:`detect` on canvases that were made with ``fit``; one result an image, in the images' order."""
+        results: dict[int, Detections] = {}
+        for batch in batches:
+            outputs = self.network.run(batch.pixels)
+            for row, (member, placement) in enumerate(zip(batch.members, batch.placements, strict=True)):
+                raw = decode_heads([output[row] for output in outputs], self.spec, score_threshold)
+                kept = suppress(raw, nms_iou)
+                results[member] = Detections(placement.to_image(kept.xyxy_px), kept.score, kept.cls)
+        return [results[member] for member in sorted(results)]
 
 
 def box_size(xyxy_px: ArrayLike) -> Array:

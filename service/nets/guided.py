@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from service.errors import PackError
 from service.geometry.transforms import Array, wrap_angle
-from service.nets.canvas import batches, canvas_size
+from service.nets.canvas import PADDED, canvas_size
+from service.nets.decoding import MAX_CANDIDATES
 from service.nets.depth import InverseDepth
-from service.nets.detector import MAX_CANDIDATES
 from service.nets.pack import Network
 
 MAX_INVERSE_DEPTH = 0.5
@@ -150,9 +150,9 @@ class GuidedDetector:
         guides: (G, h, w) an image, from :func:`guide_maps`. focal_px: vertical focal length of each image's camera.
         """
         results: dict[int, GuidedDetections] = {}
-        for members, canvases in batches(images):
-            outputs = self.network.run(canvases, np.stack([guides[member] for member in members]))
-            for row, member in enumerate(members):
+        for batch in PADDED.batches(images):
+            outputs = self.network.run(batch.pixels, np.stack([guides[member] for member in batch.members]))
+            for row, member in enumerate(batch.members):
                 raw = decode_guided([out[row] for out in outputs], self.spec, focal_px[member], score_threshold)
                 results[member] = suppress_guided(raw, nms_iou)
         return [results[member] for member in range(len(images))]

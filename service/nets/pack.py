@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,10 +20,14 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from service.errors import PackError
+from service.nets.providers import Choice, Provider, choose, session_providers, settled
+
+logger = logging.getLogger(__name__)
 
 MODELS_DIR = Path(__file__).resolve().parent.parent / "models"
 METADATA_KEY = "quadlift"
 REQUIRED_NETWORKS = ("detector", "multibin", "depth")
+_ON_CPU = Choice("cpu", True)
 # A tensor stored outside the file carries a StringStringEntryProto whose key is "location": field 1, 8 bytes.
 _EXTERNAL_DATA_MARK = b"\x0a\x08location"
 
@@ -61,12 +67,31 @@ class Network:
     name: str
     session: ort.InferenceSession
     metadata: dict[str, Any]
+    provider: Provider = "cpu"
+    """What it computes on."""
 
     def run(self, *batch: NDArray[Any]) -> list[NDArray[np.float32]]:
-        """All outputs, in the graph's order, for one batch of each input, in the graph's order too."""
+        """All outputs, in the graph's order, for one batch of each input, in the graph's order too.
+
+        A network that was exported for batches of one size gets the batch in parts of it, the last filled up with zeros.
+        """
+        size, count = self.session.get_inputs()[0].shape[0], len(batch[0])
+        if not isinstance(size, int) or count == size:
+            return self._run(batch)
+        parts = [self._run([_part(values, start, size) for values in batch]) for start in range(0, count, size)]
+        return [np.concatenate(outputs)[:count] for outputs in zip(*parts, strict=True)]
+
+    def _run(self, batch: Sequence[NDArray[Any]]) -> list[NDArray[np.float32]]:
         names = [entry.name for entry in self.session.get_inputs()]
         outputs: list[NDArray[np.float32]] = self.session.run(None, dict(zip(names, batch, strict=True)))
         return outputs
+
+
+def _part(values: NDArray[Any], start: int, size: int) -> NDArray[Any]:
+    """``size`` rows from ``start`` on; zeros beyond the last."""
+    part = np.zeros((size, *values.shape[1:]), values.dtype)
+    part[: len(values) - start] = values[start : start + size]
+    return part
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +101,11 @@ class Pack:
     path: Path
     manifest: Manifest
     networks: dict[str, Network]
+
+    @property
+    def provider(self) -> str:
+        """What the networks compute on, comma-separated where they differ."""
+        return ", ".join(sorted({network.provider for network in self.networks.values()}))
 
 
 def resolve_pack(name_or_path: str) -> Path:
@@ -91,21 +121,26 @@ def resolve_pack(name_or_path: str) -> Path:
     )
 
 
-def load_pack(name_or_path: str, *, intra_op_threads: int = 1) -> Pack:
+def load_pack(name_or_path: str, *, provider: Provider = "auto", intra_op_threads: int = 1) -> Pack:
     """Check and load a pack.
 
+    provider: what to compute on; one asked for by name must be there, ``auto`` takes the best there is.
     intra_op_threads: threads that one network run may use. With one, every thread that calls ``run`` works on its own,
     and workers scale with cores.
 
-    Raises PackError when the manifest is malformed, or a file is missing, altered, or keeps tensors outside itself.
+    Raises PackError when the manifest is malformed, or a file is missing, altered, or keeps tensors outside itself, or the
+    provider does not start; InputError when ONNX Runtime does not offer it.
     """
+    choice = choose(provider, ort.get_available_providers())
     folder = resolve_pack(name_or_path)
     manifest = _read_manifest(folder / "manifest.json")
     for name in REQUIRED_NETWORKS:
         if name not in manifest.networks:
             raise PackError(f"no network '{name}'.", field=f"{folder.name}/manifest.json", remedy="Export the pack again.")
-    networks = {name: _load_network(folder, name, entry, intra_op_threads) for name, entry in manifest.networks.items()}
-    return Pack(folder, manifest, networks)
+    networks = {name: _load_network(folder, name, entry, intra_op_threads, choice) for name, entry in manifest.networks.items()}
+    pack = Pack(folder, manifest, networks)
+    logger.info("pack %s runs on %s (asked for: %s)", manifest.name, pack.provider, provider)
+    return pack
 
 
 def session_options(intra_op_threads: int) -> ort.SessionOptions:
@@ -119,8 +154,11 @@ def session_options(intra_op_threads: int) -> ort.SessionOptions:
     return options
 
 
-def open_network(name: str, model: bytes, intra_op_threads: int = 1) -> Network:
-    """A network from the bytes of an ONNX file. Raises PackError when it is no self-contained Quadlift network."""
+def open_network(name: str, model: bytes, intra_op_threads: int = 1, choice: Choice = _ON_CPU) -> Network:
+    """A network from the bytes of an ONNX file.
+
+    Raises PackError when it is no self-contained Quadlift network, or the provider does not start.
+    """
     if _EXTERNAL_DATA_MARK in model:
         raise PackError(
             "the file keeps tensors outside itself (external data).",
@@ -128,7 +166,8 @@ def open_network(name: str, model: bytes, intra_op_threads: int = 1) -> Network:
             remedy="Save the model as one file; a pack vouches for every byte that it loads.",
         )
     try:
-        session = ort.InferenceSession(model, session_options(intra_op_threads), providers=["CPUExecutionProvider"])
+        providers = session_providers(choice, ort.get_available_providers(), intra_op_threads)
+        session = ort.InferenceSession(model, session_options(intra_op_threads), providers=providers)
     except Exception as error:  # ONNX Runtime raises a dozen unrelated types
         raise PackError(f"ONNX Runtime cannot load it: {error}", field=name, remedy="Export the pack again.") from error
     try:
@@ -137,7 +176,7 @@ def open_network(name: str, model: bytes, intra_op_threads: int = 1) -> Network:
         raise PackError(
             f"no '{METADATA_KEY}' metadata.", field=name, remedy="Export the network with `quadlift export`."
         ) from error
-    return Network(name, session, metadata)
+    return Network(name, session, metadata, settled(choice, session.get_providers(), name))
 
 
 def _read_manifest(path: Path) -> Manifest:
@@ -149,7 +188,7 @@ def _read_manifest(path: Path) -> Manifest:
         raise PackError(f"{where}: {first['msg']}.", field=str(path), remedy="Export the pack again.") from None
 
 
-def _load_network(folder: Path, name: str, entry: NetworkEntry, intra_op_threads: int) -> Network:
+def _load_network(folder: Path, name: str, entry: NetworkEntry, intra_op_threads: int, choice: Choice) -> Network:
     path = folder / entry.file
     try:
         model = path.read_bytes()
@@ -162,4 +201,4 @@ def _load_network(folder: Path, name: str, entry: NetworkEntry, intra_op_threads
             field=str(path),
             remedy="The file was altered or damaged: install or export the pack again.",
         )
-    return open_network(name, model, intra_op_threads)
+    return open_network(name, model, intra_op_threads, choice)

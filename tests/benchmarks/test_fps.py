@@ -26,6 +26,7 @@ KEYS = {
     "ratio_to_bare",
     "machine",
     "pack",
+    "provider",
 }
 
 
@@ -48,9 +49,10 @@ def test_the_figures_of_the_contract(via: str) -> None:
 
 
 def test_below_the_target_it_exits_with_1() -> None:
-    code, figures = run("--seconds", "0.5", "--cameras", "1", "--target", "1e6")
+    code, figures = run("--seconds", "0.5", "--cameras", "1", "--target", "1e6", "--provider", "cpu")
     assert code == 1
     assert figures["cameras"] == 1
+    assert figures["provider"] == "cpu"
 
 
 def test_every_set_of_a_closed_loop_is_answered() -> None:

@@ -10,7 +10,8 @@ import onnx
 import pytest
 import torch
 
-from models_export.export import Exported, to_onnx, with_metadata, write_pack
+from models_export.export import Exported, fixed_batch, to_onnx, with_metadata, write_pack
+from models_export.half import to_half
 from models_export.nets.depth import DepthConfig, EdgeDepth
 from models_export.nets.detector import DetectorConfig, EdgeDetector
 from models_export.nets.multibin import EdgeMultibin, MultibinConfig
@@ -112,3 +113,35 @@ def test_a_network_without_metadata_is_refused(detector: tuple[EdgeDetector, byt
     del bare.metadata_props[:]
     with pytest.raises(PackError, match="metadata"):
         open_network("detector", bare.SerializeToString())
+
+
+def test_half_precision_is_half_as_large_and_passes_its_gate(detector: tuple[EdgeDetector, bytes]) -> None:
+    net, model = detector
+    half = to_half(model)
+    graph = onnx.load_from_string(half).graph
+    # What is left in float are scales of a Resize, which the operator wants so.
+    assert all(int(np.prod(entry.dims)) <= 4 for entry in graph.initializer if entry.data_type == onnx.TensorProto.FLOAT)
+    assert len(half) < 0.6 * len(model)
+    network = open_network("detector", half)
+    assert network.session.get_inputs()[0].type == "tensor(uint8)"
+    assert {output.type for output in network.session.get_outputs()} == {"tensor(float)"}
+    batches = [street_like(96, 160), street_like(64, 224, 1)]
+    assert 1e-6 < require_parity(net, network, batches, "fp16") < 1e-2
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_a_fixed_batch_serves_any_number_of_images(detector: tuple[EdgeDetector, bytes], count: int) -> None:
+    net, model = detector
+    network = open_network("detector", fixed_batch(model, 2))
+    assert network.session.get_inputs()[0].shape[0] == 2
+    assert all(output.shape[0] == 2 for output in network.session.get_outputs())
+    require_parity(net, network, [street_like(64, 96, count)])
+
+
+def test_a_fixed_batch_of_quantized_and_half_models(detector: tuple[EdgeDetector, bytes]) -> None:
+    net, model = detector
+    batches = [street_like(96, 160)]
+    for lowered in (with_metadata(quantize(model, batches, keep_float=HEADS), METADATA), to_half(model)):
+        network = open_network("detector", fixed_batch(lowered, 3))
+        assert network.session.get_inputs()[0].shape[0] == 3
+        assert parity(net, network, batches) < 0.2

@@ -10,7 +10,8 @@ from models_export.nets.depth import DepthConfig, EdgeDepth
 from models_export.nets.detector import DetectorConfig, EdgeDetector
 from models_export.nets.multibin import EdgeMultibin, MultibinConfig
 from models_export.train.detector import assign, decode, detector_loss
-from service.nets.detector import DetectorSpec, decode_heads
+from service.nets.decoding import decode_heads
+from service.nets.detector_spec import DetectorSpec
 from service.nets.error_model import ErrorModel
 
 CONFIG = DetectorConfig()

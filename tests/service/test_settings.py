@@ -21,7 +21,15 @@ def test_environment_is_read_and_arguments_win(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"port": 70000}, {"workers": 0}, {"score_threshold": 2}, {"deadline_ms": 0}, {"max_pixels": "x"}, {"hard_mode": "on"}],
+    [
+        {"port": 70000},
+        {"workers": 0},
+        {"score_threshold": 2},
+        {"deadline_ms": 0},
+        {"max_pixels": "x"},
+        {"provider": "x"},
+        {"hard_mode": "on"},
+    ],
 )
 def test_impossible_values_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ValidationError, match=next(iter(wrong))):

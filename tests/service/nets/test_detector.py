@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from service.errors import PackError
-from service.nets.detector import Detections, DetectorSpec, decode_heads, edge_sigma, suppress
+from service.nets.decoding import decode_heads
+from service.nets.detections import Detections, suppress
+from service.nets.detector import edge_sigma
+from service.nets.detector_spec import DetectorSpec
 from service.nets.error_model import ErrorModel
 
 SPEC = DetectorSpec(("car",), (8,), (((20.0, 10.0),),), 672, ErrorModel(0.5, 0.01, 0.0, 3.0))

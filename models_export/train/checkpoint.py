@@ -1,0 +1,47 @@
+"""Checkpoints: one file that training goes on from, and that export reads."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from service.errors import InputError
+
+
+def write_checkpoint(path: Path, contents: Mapping[str, Any]) -> None:
+    """Write a checkpoint in one move: a process that dies leaves the old one or the new one."""
+    temporary = path.with_suffix(".tmp")
+    torch.save({**contents, "saved_at": time.time()}, temporary)
+    temporary.replace(path)
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """A checkpoint's contents, on the CPU. Raises InputError when there is none."""
+    if not path.is_file():
+        raise InputError("no such checkpoint.", field=str(path), remedy="Train the network first.")
+    state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    return state
+
+
+def require_same(path: Path, saved: Mapping[str, Any], ours: Mapping[str, Any], what: str) -> None:
+    """Raise InputError, naming the first setting that differs, unless a saved description equals ours."""
+    for key in sorted({*saved, *ours}):
+        if saved.get(key) != ours.get(key):
+            raise InputError(
+                f"the checkpoint's {what} differs from this run's: {key} was {saved.get(key)!r}, now {ours.get(key)!r}.",
+                field=str(path),
+                remedy="Resume with the same options, or start anew without --resume.",
+            )
+
+
+def load_averaged(checkpoint: Path, net: nn.Module) -> tuple[nn.Module, dict[str, Any]]:
+    """The averaged weights of a checkpoint in ``net``, in eval mode, and the checkpoint's description."""
+    state = read_checkpoint(checkpoint)
+    weights = {key.removeprefix("module."): value for key, value in state["averaged"].items() if key != "n_averaged"}
+    net.load_state_dict(weights)
+    return net.eval(), state
