@@ -14,6 +14,7 @@ from rich.markup import escape
 from models_export.data.real import RealData
 from models_export.edge import edge_recipe
 from models_export.packing import ExportOptions, export
+from models_export.paper import paper_recipe
 from models_export.recipe import PackRecipe, train
 from models_export.train.config import TrainConfig
 from service.errors import InputError, QuadliftError
@@ -28,6 +29,7 @@ class PackName(StrEnum):
     """Packs that can be trained."""
 
     EDGE = "edge"
+    PAPER = "paper"
 
 
 class PrecisionName(StrEnum):
@@ -111,7 +113,7 @@ def export_command(
 
 
 def _recipe(pack: PackName) -> PackRecipe:
-    return {PackName.EDGE: edge_recipe}[pack]()
+    return {PackName.EDGE: edge_recipe, PackName.PAPER: paper_recipe}[pack]()
 
 
 def _recordings(folder: Path | None, taught: Path | None) -> RealData | None:

@@ -29,6 +29,8 @@ class GuidedFrame:
 
     canvas: NDArray[np.uint8]
     """(H, W, 3) RGB."""
+    labels: dict[str, str]
+    """Camera and weather, for validation."""
     image_size: tuple[int, int]
     """Width and height of the image inside the canvas, px."""
     K: Array
@@ -89,6 +91,7 @@ def _frame(sample: Sample, depth: DepthNet) -> GuidedFrame:
     shape = sample.canvas.shape[0] // depth.stride, sample.canvas.shape[1] // depth.stride
     return GuidedFrame(
         canvas=sample.canvas,
+        labels=sample.labels,
         image_size=sample.image_size,
         K=camera.K,
         R_cam_world=camera.R_cam_world,

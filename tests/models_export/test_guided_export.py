@@ -13,7 +13,7 @@ import torch
 from models_export.data.guided_frames import guided_frames
 from models_export.data.samples import Sample
 from models_export.export import Exported, with_metadata
-from models_export.guided import GuidedRecipe, add_to_pack, guided_onnx, real_inputs
+from models_export.guided import EDGE_RECIPE, PAPER_RECIPE, add_to_pack, guided_onnx, real_inputs
 from models_export.guided_scores import measure
 from models_export.nets.guided import EdgeGuided, GuidedConfig
 from models_export.train.guided_targets import AssignConfig, fit_spec
@@ -40,7 +40,7 @@ def model(toy_samples: list[Sample]) -> bytes:
         net.heads.heads[0].bias.view(-1, 2)[:, 0] = 0.1
     frames = guided_frames(toy_samples, DepthNet(load_pack("edge").networks["depth"]))
     spec = fit_spec(frames, SMALL, ASSIGN)
-    model = with_metadata(guided_onnx(net, SMALL), spec.to_metadata())
+    model = with_metadata(guided_onnx(net, SMALL, (96, 160)), spec.to_metadata())
     inputs = [real_inputs(spec, frames[:3]), real_inputs(spec, frames[:1], cut=True)]
     assert require_parity(net, open_network("guided", model), inputs) < 1e-3
     return model
@@ -95,10 +95,6 @@ def test_always_adds_boxes_and_never_changes_none(pack_folder: Path, method: str
     assert sum(guided.detections.values()) == sum(len(own) for own in guided.per_camera)
 
 
-def test_a_bright_quiet_street_is_not_hard(pack_folder: Path) -> None:
-    assert Pipeline(load_pack(str(pack_folder)), PipelineSettings()).run(frame_set()).hard == frozenset()
-
-
 def test_always_without_the_network_is_refused() -> None:
     with pytest.raises(PackError, match=r"no network 'guided'.*hard_mode auto or never"):
         Pipeline(load_pack("edge"), PipelineSettings(hard_mode="always"))
@@ -113,6 +109,10 @@ def test_scores_are_measured_by_the_services_code(model: bytes, toy_samples: lis
     assert errors.scores["vehicles"] == 16
 
 
-def test_the_recipe_is_the_edge_size() -> None:
-    assert GuidedRecipe().net.learned_sigma
-    assert GuidedRecipe().net.guides == ("depth", "ground")
+def test_the_papers_recipe_is_as_published() -> None:
+    training = PAPER_RECIPE.training
+    assert (training.optimizer, training.learning_rate, training.weight_decay) == ("sgd", 0.01, 5e-4)
+    assert (PAPER_RECIPE.loss.gamma, PAPER_RECIPE.loss.focal_on, PAPER_RECIPE.loss.corner) == (1.0, "class", 0.0)
+    assert (PAPER_RECIPE.assign.foreground_iou, PAPER_RECIPE.assign.best_iou) == (0.5, 0.35)
+    assert not PAPER_RECIPE.net.learned_sigma
+    assert EDGE_RECIPE.net.learned_sigma

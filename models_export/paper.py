@@ -1,0 +1,116 @@
+"""The recipe of pack ``paper``: the source paper's networks, at their published size unless other shapes are given."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+from models_export.darknet_weights import read_backbone
+from models_export.metadata import depth_metadata, multibin_metadata, yolov3_metadata
+from models_export.nets.dpt import DptConfig, DptHybrid
+from models_export.nets.vgg_multibin import VggMultibin, VggMultibinConfig
+from models_export.nets.yolov3 import Yolov3, Yolov3Config
+from models_export.recipe import NetworkRecipe, PackRecipe, load_checkpoint
+from models_export.train.config import TrainConfig
+from models_export.train.depth import DepthTask
+from models_export.train.multibin import MultibinTask
+from models_export.train.yolov3 import Yolov3Task
+
+DEPTH_CANVAS_HW = (192, 672)
+"""Height and width, px, of the depth net's input: the canvas of the paper's 1284x384 frames at half size, which lie on it
+unscaled."""
+_CHECKPOINT = ".pt"
+
+
+def paper_recipe(
+    detector: Yolov3Config | None = None,
+    multibin: VggMultibinConfig | None = None,
+    depth: DptConfig | None = None,
+    depth_canvas_hw: tuple[int, int] = DEPTH_CANVAS_HW,
+) -> PackRecipe:
+    """The pack at its published size, or with networks of other shapes."""
+    return PackRecipe(
+        name="paper",
+        version="1",
+        networks=(
+            _detector(detector or Yolov3Config()),
+            _multibin(multibin or VggMultibinConfig()),
+            _depth(depth or DptConfig(), depth_canvas_hw),
+        ),
+    )
+
+
+def _detector(config: Yolov3Config) -> NetworkRecipe:
+    """Darknet trains by SGD for half a million steps; AdamW learns from the same loss in a small part of that."""
+    return NetworkRecipe(
+        name="detector",
+        config=config,
+        build=Yolov3,
+        task=Yolov3Task,
+        training=TrainConfig(steps=20_000, batch_size=16, learning_rate=1e-3, weight_decay=5e-4, clip_norm=10.0),
+        outputs=config.outputs,
+        metadata=yolov3_metadata,
+        load_pretrained=load_yolov3,
+    )
+
+
+def _multibin(config: VggMultibinConfig) -> NetworkRecipe:
+    """The paper's rate from the first step on."""
+    return NetworkRecipe(
+        name="multibin",
+        config=config,
+        build=VggMultibin,
+        task=partial(MultibinTask, build=VggMultibin),
+        training=TrainConfig(
+            steps=20_000, batch_size=16, optimizer="adam", learning_rate=1e-4, weight_decay=0.0, warmup_steps=0
+        ),
+        outputs=("vectors", "confidence", "residual"),
+        metadata=multibin_metadata,
+        canvas_hw=(config.crop_px, config.crop_px),
+        load_pretrained=load_multibin,
+    )
+
+
+def _depth(config: DptConfig, canvas_hw: tuple[int, int]) -> NetworkRecipe:
+    """1e-4 for the decoder; the encoder learns at a tenth of it."""
+    return NetworkRecipe(
+        name="depth",
+        config=config,
+        build=DptHybrid,
+        task=partial(DepthTask, build=DptHybrid),
+        training=TrainConfig(
+            steps=10_000, batch_size=8, optimizer="adam", learning_rate=1e-4, weight_decay=0.0, warmup_steps=0
+        ),
+        outputs=("inverse_depth",),
+        metadata=depth_metadata,
+        canvas_hw=canvas_hw,
+        load_pretrained=load_depth,
+        for_export=DptHybrid.with_folded_weights,
+    )
+
+
+def load_yolov3(net: Yolov3, path: Path) -> None:
+    """Start from the convolutions of a Darknet file, whole or partial, or from an earlier run's checkpoint (``.pt``).
+
+    Raises InputError for a file that does not fit, as do the other two.
+    """
+    if path.suffix == _CHECKPOINT:
+        load_checkpoint(net, path)
+    else:
+        read_backbone(net, path)
+
+
+def load_multibin(net: VggMultibin, path: Path) -> None:
+    """Start from torchvision's VGG16 (``.pth``), or from an earlier run's checkpoint (``.pt``)."""
+    if path.suffix == _CHECKPOINT:
+        load_checkpoint(net, path)
+    else:
+        net.load_imagenet(path)
+
+
+def load_depth(net: DptHybrid, path: Path) -> None:
+    """Start from a folder with a DPT-hybrid in the form of ``transformers``, or from an earlier run's checkpoint (``.pt``)."""
+    if path.suffix == _CHECKPOINT:
+        load_checkpoint(net, path)
+    else:
+        net.load_pretrained(path)
