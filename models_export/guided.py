@@ -1,4 +1,4 @@
-"""The recipes of the depth-guided detector: trained beside a pack's depth net, and added to that pack."""
+"""The depth-guided detector: its recipe, its training beside a pack's depth net, and its export into that pack."""
 
 from __future__ import annotations
 
@@ -15,22 +15,21 @@ from torch import nn
 from torch.export import Dim
 
 from models_export.data.augment import AugmentConfig
-from models_export.data.guided_frames import NO_GUIDE_NOISE, GuidedFrame, GuideNoise, Map, frame_maps, guided_frames
+from models_export.data.guided_frames import GuidedFrame, GuideNoise, Map, frame_maps, guided_frames
 from models_export.data.samples import Sample, load_samples, split_scenes
 from models_export.export import MAX_TILES, Exported, trace, with_metadata, write_pack
 from models_export.guided_losses import GuidedLossConfig
 from models_export.guided_scores import measure
 from models_export.nets.blocks import parameter_count
-from models_export.nets.guided import OUTPUTS, PAPER, EdgeGuided, GuidedConfig, ResNetGuided
+from models_export.nets.guided import OUTPUTS, EdgeGuided, GuidedConfig, ResNetGuided
 from models_export.nets.resnet import load_imagenet
-from models_export.recipe import load_checkpoint
-from models_export.train.checkpoint import load_averaged, read_checkpoint
+from models_export.train.checkpoint import load_averaged, load_checkpoint, read_checkpoint
 from models_export.train.config import TrainConfig
 from models_export.train.guided import GuidedTask
 from models_export.train.guided_targets import AssignConfig
 from models_export.train.loop import fit
 from models_export.verify import require_parity
-from service.nets.canvas import ALIGN_PX
+from service.nets.canvas import ALIGN_PX, PADDED, InputFit
 from service.nets.depth import DepthNet
 from service.nets.guided import GuidedDetector, GuidedSpec
 from service.nets.pack import Manifest, Pack, load_pack, open_network
@@ -54,22 +53,6 @@ class GuidedRecipe:
     training: TrainConfig = field(
         default_factory=lambda: TrainConfig(steps=4000, batch_size=8, learning_rate=6e-3, ema_decay=0.995, amp=False)
     )
-
-
-EDGE_RECIPE = GuidedRecipe()
-PAPER_RECIPE = GuidedRecipe(
-    net=PAPER,
-    build=ResNetGuided,
-    assign=AssignConfig(),
-    loss=GuidedLossConfig(),
-    noise=NO_GUIDE_NOISE,
-    training=TrainConfig(
-        epochs=30, batch_size=4, optimizer="sgd", learning_rate=0.01, weight_decay=5e-4, schedule="multistep", workers=4
-    ),
-)
-"""D4LCN's: anchors, loss and optimiser as published."""
-RECIPES = {"edge": EDGE_RECIPE, "paper": PAPER_RECIPE}
-"""By size."""
 
 
 def train_guided(
@@ -100,7 +83,7 @@ def _start_from(net: EdgeGuided | ResNetGuided, path: Path) -> None:
 
 
 def _frames(scenes: Sequence[Path], depth: DepthNet, recipe: GuidedRecipe) -> tuple[list[Sample], list[GuidedFrame]]:
-    samples = load_samples(scenes, recipe.net.classes, recipe.net.max_width, depth.stride)
+    samples = load_samples(scenes, recipe.net.classes, recipe.net.max_width, recipe.net.guide_stride)
     return samples, guided_frames(samples, depth)
 
 
@@ -114,8 +97,8 @@ def export_guided(
     base = load_pack(pack)
     state = read_checkpoint(runs / f"{GuidedTask.name}.pt")
     net = load_averaged(runs / f"{GuidedTask.name}.pt", recipe.build(recipe.net))[0]
-    spec = GuidedSpec.from_metadata(state["task"]["spec"])
     samples, frames = _frames(split_scenes(data)[1], DepthNet(base.networks["depth"]), recipe)
+    spec = replace(GuidedSpec.from_metadata(state["task"]["spec"]), fit=fit_of(net, frames))
     model = guided_onnx(net, recipe.net, frames[0].canvas.shape[:2])
     network = open_network(GuidedTask.name, with_metadata(model, spec.to_metadata()))
     inputs = [real_inputs(spec, frames[:_PARITY_FRAMES])]
@@ -129,6 +112,12 @@ def export_guided(
     added = Exported(GuidedTask.name, with_metadata(model, spec.to_metadata()), "fp32", parameter_count(net))
     provenance = {"training": state["config"], "task": state["task"], "steps": state["step"], "data": [d.name for d in data]}
     return add_to_pack(base, out, added, provenance, scores)
+
+
+def fit_of(net: nn.Module, frames: Sequence[GuidedFrame]) -> InputFit:
+    """Any canvas for the edge size; for the published one that of the frames."""
+    height, width = frames[0].canvas.shape[:2]
+    return PADDED if isinstance(net, EdgeGuided) else InputFit((width, height))
 
 
 def guided_onnx(net: nn.Module, config: GuidedConfig, canvas_hw: tuple[int, int]) -> bytes:

@@ -6,13 +6,20 @@ from functools import partial
 from pathlib import Path
 
 from models_export.darknet_weights import read_backbone
+from models_export.data.guided_frames import NO_GUIDE_NOISE
+from models_export.guided import GuidedRecipe
+from models_export.guided_losses import GuidedLossConfig
 from models_export.metadata import depth_metadata, multibin_metadata, yolov3_metadata
 from models_export.nets.dpt import DptConfig, DptHybrid
+from models_export.nets.guided import PAPER as PUBLISHED
+from models_export.nets.guided import ResNetGuided
 from models_export.nets.vgg_multibin import VggMultibin, VggMultibinConfig
 from models_export.nets.yolov3 import Yolov3, Yolov3Config
-from models_export.recipe import NetworkRecipe, PackRecipe, load_checkpoint
+from models_export.recipe import NetworkRecipe, PackRecipe
+from models_export.train.checkpoint import load_checkpoint
 from models_export.train.config import TrainConfig
 from models_export.train.depth import DepthTask
+from models_export.train.guided_targets import AssignConfig
 from models_export.train.multibin import MultibinTask
 from models_export.train.yolov3 import Yolov3Task
 
@@ -26,6 +33,7 @@ def paper_recipe(
     detector: Yolov3Config | None = None,
     multibin: VggMultibinConfig | None = None,
     depth: DptConfig | None = None,
+    guided: GuidedRecipe | None = None,
     depth_canvas_hw: tuple[int, int] = DEPTH_CANVAS_HW,
 ) -> PackRecipe:
     """The pack at its published size, or with networks of other shapes."""
@@ -37,6 +45,7 @@ def paper_recipe(
             _multibin(multibin or VggMultibinConfig()),
             _depth(depth or DptConfig(), depth_canvas_hw),
         ),
+        guided=guided or _guided(),
     )
 
 
@@ -86,6 +95,20 @@ def _depth(config: DptConfig, canvas_hw: tuple[int, int]) -> NetworkRecipe:
         canvas_hw=canvas_hw,
         load_pretrained=load_depth,
         for_export=DptHybrid.with_folded_weights,
+    )
+
+
+def _guided() -> GuidedRecipe:
+    """D4LCN's: anchors, loss and optimiser as published."""
+    return GuidedRecipe(
+        net=PUBLISHED,
+        build=ResNetGuided,
+        assign=AssignConfig(),
+        loss=GuidedLossConfig(),
+        noise=NO_GUIDE_NOISE,
+        training=TrainConfig(
+            epochs=30, batch_size=4, optimizer="sgd", learning_rate=0.01, weight_decay=5e-4, schedule="multistep", workers=4
+        ),
     )
 
 

@@ -31,7 +31,6 @@ _HELP = {
     "demo": "Show a live four-camera intersection in the browser.",
     "feed": "Push recordings or live cameras to a running service.",
     "scenes": "Render simulated scenes for training and tests.",
-    "guided": "Train the depth-guided detector and add it to a pack.",
     "train": "Train the networks.",
     "export": "Export trained networks to an ONNX pack.",
     "import-darknet": "Make a pack around YOLOv3 weights in a Darknet file.",

@@ -45,3 +45,14 @@ def load_averaged(checkpoint: Path, net: nn.Module) -> tuple[nn.Module, dict[str
     weights = {key.removeprefix("module."): value for key, value in state["averaged"].items() if key != "n_averaged"}
     net.load_state_dict(weights)
     return net.eval(), state
+
+
+def load_checkpoint(net: nn.Module, path: Path) -> None:
+    """Start from the averaged weights of an earlier run's checkpoint. Raises InputError when they do not fit."""
+    try:
+        load_averaged(path, net)
+    except (RuntimeError, KeyError) as error:
+        raise InputError(
+            f"holds no weights of this network: {error}", field=str(path), remedy="Give its checkpoint."
+        ) from error
+    net.train()

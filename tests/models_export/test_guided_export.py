@@ -12,14 +12,17 @@ import torch
 
 from models_export.data.guided_frames import guided_frames
 from models_export.data.samples import Sample
+from models_export.edge import edge_recipe
 from models_export.export import Exported, with_metadata
-from models_export.guided import EDGE_RECIPE, PAPER_RECIPE, add_to_pack, guided_onnx, real_inputs
+from models_export.guided import add_to_pack, fit_of, guided_onnx, real_inputs
 from models_export.guided_scores import measure
-from models_export.nets.guided import EdgeGuided, GuidedConfig
+from models_export.nets.guided import PAPER, EdgeGuided, GuidedConfig, ResNetGuided
+from models_export.paper import paper_recipe
 from models_export.train.guided_targets import AssignConfig, fit_spec
 from models_export.verify import require_parity
 from service.errors import PackError
 from service.frames import EncodedFrame, FrameSet
+from service.nets.canvas import PADDED, InputFit
 from service.nets.depth import DepthNet
 from service.nets.guided import GuidedDetector
 from service.nets.pack import load_pack, open_network
@@ -110,9 +113,25 @@ def test_scores_are_measured_by_the_services_code(model: bytes, toy_samples: lis
 
 
 def test_the_papers_recipe_is_as_published() -> None:
-    training = PAPER_RECIPE.training
-    assert (training.optimizer, training.learning_rate, training.weight_decay) == ("sgd", 0.01, 5e-4)
-    assert (PAPER_RECIPE.loss.gamma, PAPER_RECIPE.loss.focal_on, PAPER_RECIPE.loss.corner) == (1.0, "class", 0.0)
-    assert (PAPER_RECIPE.assign.foreground_iou, PAPER_RECIPE.assign.best_iou) == (0.5, 0.35)
-    assert not PAPER_RECIPE.net.learned_sigma
-    assert EDGE_RECIPE.net.learned_sigma
+    paper = paper_recipe().guided
+    assert (paper.training.optimizer, paper.training.learning_rate, paper.training.weight_decay) == ("sgd", 0.01, 5e-4)
+    assert (paper.loss.gamma, paper.loss.focal_on, paper.loss.corner) == (1.0, "class", 0.0)
+    assert (paper.assign.foreground_iou, paper.assign.best_iou) == (0.5, 0.35)
+    assert not paper.net.learned_sigma
+    assert edge_recipe().guided.net.learned_sigma
+
+
+def test_the_published_size_says_which_canvas_it_takes(toy_samples: list[Sample]) -> None:
+    frames = guided_frames(toy_samples[:1], DepthNet(load_pack("edge").networks["depth"]))
+    assert fit_of(EdgeGuided(SMALL), frames) == PADDED
+    with torch.device("meta"):
+        assert fit_of(ResNetGuided(PAPER), frames) == InputFit((160, 96))
+
+
+def test_maps_follow_the_guides_cells_not_the_depth_nets(toy_samples: list[Sample]) -> None:
+    sample = toy_samples[0]
+    coarse = replace(sample, inverse_depth=sample.inverse_depth[::2, ::2])
+    depth = DepthNet(load_pack("edge").networks["depth"])
+    fine, half = guided_frames([sample, coarse], depth)
+    assert half.metric.shape == half.ground.shape == (6, 10)
+    np.testing.assert_allclose(half.metric, fine.metric.reshape(6, 2, 10, 2).mean((1, 3)), atol=0.02)
