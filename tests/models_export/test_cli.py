@@ -41,7 +41,7 @@ def runs(toy_scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("models_export.cli.edge_recipe", small_recipe)
         run_train("all", toy_scenes, out, "--steps", "6", "--batch-size", "4")
-        run_train("detector", toy_scenes, out, "--steps", "120", "--batch-size", "8")
+        run_train("detector", toy_scenes, out, "--steps", "80", "--batch-size", "6")
     return out
 
 
@@ -72,11 +72,11 @@ def test_training_writes_checkpoints_logs_and_curves(runs: Path) -> None:
 
 def test_options_reach_the_run(toy_scenes: Path, tmp_path: Path, runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("models_export.cli.edge_recipe", small_recipe)
-    epoch = ("--epochs", "0.02", "--batch-size", "4", "--amp", "--seed", "7", "--init", str(runs / "depth.pt"))
+    epoch = ("--epochs", "0.1", "--batch-size", "4", "--amp", "--seed", "7", "--init", str(runs / "depth.pt"))
     run_train("depth", toy_scenes, tmp_path, *epoch)
     state = read_checkpoint(tmp_path / "depth.pt")
     given = {key: state["config"][key] for key in ("steps", "epochs", "batch_size", "amp", "seed", "init")}
-    # Ten scenes of 40 frames train.
+    # Ten scenes of 8 frames train.
     assert given == {"steps": 2, "epochs": None, "batch_size": 4, "amp": True, "seed": 7, "init": "depth.pt"}
     run_train("depth", toy_scenes, tmp_path, *epoch, "--resume")
 

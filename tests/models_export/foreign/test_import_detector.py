@@ -172,7 +172,7 @@ def test_a_real_detector_finds_real_vehicles(tmp_path: Path, monkeypatch: pytest
     import_detector(ImportRequest(model, "nanodet", tmp_path / "pack", COCO_CLASSES, to_car))
     score = clip_score.score_roadside(Pipeline(load_pack(str(tmp_path / "pack"))), clip)["2d"]
     print(score)
-    # Measured: 39 found, 22 false. A wrong order of the channels finds 33, a wrong reference point in the cell 20 with 41 false.
+    # Measured: 39 found, 22 false. A wrong order of the channels finds 33; a wrong reference point in the cell 20, 41 false.
     assert score["references"] == 101
     assert score["recalled"] >= 37
     assert score["false"] <= 25
