@@ -13,8 +13,9 @@ import torch
 from models_export.data.augment import NO_AUGMENT
 from models_export.data.dataset import parse_truth
 from models_export.data.guided_frames import NO_GUIDE_NOISE, GuidedFrame, GuideNoise
+from models_export.guided import PAPER_RECIPE
 from models_export.guided_losses import GuidedLossConfig, corner_loss
-from models_export.nets.guided import EdgeGuided, GuidedConfig
+from models_export.nets.guided import EdgeGuided, GuidedConfig, ResNetGuided
 from models_export.train.guided import GuidedTask, guided_loss
 from models_export.train.guided_corners import corners
 from models_export.train.guided_targets import AssignConfig
@@ -177,3 +178,19 @@ def test_a_disturbed_map_is_another_map(frames: list[GuidedFrame]) -> None:
     assert torch.equal(still[:, 1], moved[:, 1])
     assert not torch.allclose(still[:, 0], moved[:, 0])
     assert moved.min() >= 0
+
+
+def test_the_published_size_learns_in_both_branches(frames: list[GuidedFrame]) -> None:
+    torch.manual_seed(0)
+    torch.set_num_threads(1)
+    recipe = PAPER_RECIPE
+    task = GuidedTask(
+        frames[:2], ResNetGuided(recipe.net), assign=AssignConfig(best_iou=0.1), loss=recipe.loss, augment=STILL,
+        noise=recipe.noise,
+    )  # fmt: skip
+    losses = task.loss(task.net, task.batch(np.arange(2), np.random.default_rng(0)))
+    losses["total"].backward()
+    assert torch.isfinite(losses["total"])
+    assert losses["box_3d"].item() > 0
+    for branch in (task.net.image, task.net.depth):
+        assert branch.conv1.weight.grad.abs().max() > 0
