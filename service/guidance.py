@@ -41,8 +41,9 @@ class GuidanceSettings:
 
     hardness: HardnessSettings = field(default_factory=HardnessSettings)
     """When ``auto`` takes a camera's view for hard."""
-    score_threshold: float = 0.3
-    """Guided boxes of a lower score are dropped."""
+    score_threshold: float = 0.45
+    """Guided boxes of a lower score are dropped. On held-out training scenes a lower one costs more precision than it gains
+    recall (docs/hard-mode.md)."""
     nms_iou: float = 0.4
     """2D boxes that overlap a better one by more are dropped."""
     duplicate_iou: float = 0.1
