@@ -22,7 +22,6 @@ from models_export.guided_losses import GuidedLossConfig
 from models_export.guided_scores import measure
 from models_export.nets.blocks import parameter_count
 from models_export.nets.guided import OUTPUTS, EdgeGuided, GuidedConfig, ResNetGuided
-from models_export.nets.resnet import load_imagenet
 from models_export.train.checkpoint import load_averaged, load_checkpoint, read_checkpoint
 from models_export.train.config import TrainConfig
 from models_export.train.guided import GuidedTask
@@ -50,6 +49,8 @@ class GuidedRecipe:
     """Gamma 2, for no anchors are left out of the background here, and most are easy."""
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     noise: GuideNoise = field(default_factory=GuideNoise)
+    load_pretrained: Callable[[Any, Path], None] = load_checkpoint
+    """Puts the weights of a user's file into the network."""
     training: TrainConfig = field(
         default_factory=lambda: TrainConfig(steps=4000, batch_size=8, learning_rate=6e-3, ema_decay=0.995, amp=False)
     )
@@ -60,8 +61,8 @@ def train_guided(
 ) -> nn.Module:
     """Train on the training scenes of ``data``, guided by the maps of the pack's own depth net.
 
-    Checkpoint, logs and curves go to ``out``. init: an earlier checkpoint (edge), or an ImageNet ResNet-50's weights for both
-    branches (paper). Raises InputError for too little data and weights that do not fit, PackError for an unusable pack.
+    Checkpoint, logs and curves go to ``out``. init: weights to start from; not read when resuming. Raises InputError for too
+    little data and weights that do not fit, PackError for an unusable pack.
     """
     depth = DepthNet(load_pack(pack).networks["depth"])
     training, held_out = (_frames(scenes, depth, recipe)[1] for scenes in split_scenes(data))
@@ -70,16 +71,9 @@ def train_guided(
     net = recipe.build(recipe.net)
     task = GuidedTask(training, net, assign=recipe.assign, loss=recipe.loss, augment=recipe.augment, noise=recipe.noise)
     if init is not None and not resume:
-        _start_from(net, init)
+        recipe.load_pretrained(net, init)
     config = replace(recipe.training, init=None if init is None else init.name)
     return fit(task, config, out, task.held_out(held_out), resume=resume)
-
-
-def _start_from(net: EdgeGuided | ResNetGuided, path: Path) -> None:
-    if isinstance(net, ResNetGuided):
-        load_imagenet((net.image, net.depth), path)
-    else:
-        load_checkpoint(net, path)
 
 
 def _frames(scenes: Sequence[Path], depth: DepthNet, recipe: GuidedRecipe) -> tuple[list[Sample], list[GuidedFrame]]:

@@ -13,10 +13,11 @@ from models_export.metadata import depth_metadata, multibin_metadata, yolov3_met
 from models_export.nets.dpt import DptConfig, DptHybrid
 from models_export.nets.guided import PAPER as PUBLISHED
 from models_export.nets.guided import ResNetGuided
+from models_export.nets.resnet import load_imagenet
 from models_export.nets.vgg_multibin import VggMultibin, VggMultibinConfig
 from models_export.nets.yolov3 import Yolov3, Yolov3Config
 from models_export.recipe import NetworkRecipe, PackRecipe
-from models_export.train.checkpoint import load_checkpoint
+from models_export.train.checkpoint import checkpoint_or
 from models_export.train.config import TrainConfig
 from models_export.train.depth import DepthTask
 from models_export.train.guided_targets import AssignConfig
@@ -26,7 +27,6 @@ from models_export.train.yolov3 import Yolov3Task
 DEPTH_CANVAS_HW = (192, 672)
 """Height and width, px, of the depth net's input: the canvas of the paper's 1284x384 frames at half size, which lie on it
 unscaled."""
-_CHECKPOINT = ".pt"
 
 
 def paper_recipe(
@@ -59,7 +59,7 @@ def _detector(config: Yolov3Config) -> NetworkRecipe:
         training=TrainConfig(steps=20_000, batch_size=16, learning_rate=1e-3, weight_decay=5e-4, clip_norm=10.0),
         outputs=config.outputs,
         metadata=yolov3_metadata,
-        load_pretrained=load_yolov3,
+        load_pretrained=checkpoint_or(read_backbone),
     )
 
 
@@ -76,7 +76,7 @@ def _multibin(config: VggMultibinConfig) -> NetworkRecipe:
         outputs=("vectors", "confidence", "residual"),
         metadata=multibin_metadata,
         canvas_hw=(config.crop_px, config.crop_px),
-        load_pretrained=load_multibin,
+        load_pretrained=checkpoint_or(VggMultibin.load_imagenet),
     )
 
 
@@ -93,7 +93,7 @@ def _depth(config: DptConfig, canvas_hw: tuple[int, int]) -> NetworkRecipe:
         outputs=("inverse_depth",),
         metadata=depth_metadata,
         canvas_hw=canvas_hw,
-        load_pretrained=load_depth,
+        load_pretrained=checkpoint_or(DptHybrid.load_pretrained),
         for_export=DptHybrid.with_folded_weights,
     )
 
@@ -106,34 +106,13 @@ def _guided() -> GuidedRecipe:
         assign=AssignConfig(),
         loss=GuidedLossConfig(),
         noise=NO_GUIDE_NOISE,
+        load_pretrained=checkpoint_or(_load_branches),
         training=TrainConfig(
             epochs=30, batch_size=4, optimizer="sgd", learning_rate=0.01, weight_decay=5e-4, schedule="multistep", workers=4
         ),
     )
 
 
-def load_yolov3(net: Yolov3, path: Path) -> None:
-    """Start from the convolutions of a Darknet file, whole or partial, or from an earlier run's checkpoint (``.pt``).
-
-    Raises InputError for a file that does not fit, as do the other two.
-    """
-    if path.suffix == _CHECKPOINT:
-        load_checkpoint(net, path)
-    else:
-        read_backbone(net, path)
-
-
-def load_multibin(net: VggMultibin, path: Path) -> None:
-    """Start from torchvision's VGG16 (``.pth``), or from an earlier run's checkpoint (``.pt``)."""
-    if path.suffix == _CHECKPOINT:
-        load_checkpoint(net, path)
-    else:
-        net.load_imagenet(path)
-
-
-def load_depth(net: DptHybrid, path: Path) -> None:
-    """Start from a folder with a DPT-hybrid in the form of ``transformers``, or from an earlier run's checkpoint (``.pt``)."""
-    if path.suffix == _CHECKPOINT:
-        load_checkpoint(net, path)
-    else:
-        net.load_pretrained(path)
+def _load_branches(net: ResNetGuided, path: Path) -> None:
+    """One ResNet-50 for image and depth map."""
+    load_imagenet((net.image, net.depth), path)

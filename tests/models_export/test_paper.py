@@ -65,9 +65,6 @@ def test_the_pack_is_trained_exported_and_served(toy_scenes: Path, tmp_path: Pat
     run(train_app, "all", *common, "--steps", 4, "--batch-size", 4)
     assert read_checkpoint(runs / "depth.pt")["config"]["optimizer"] == "adam"
     # So little training finds no vehicle, and then there is nothing to measure errors on.
-    refused = CliRunner().invoke(export_app, [str(part) for part in (*common, "--out", first)])
-    assert refused.exit_code == 1
-    assert "finds next to nothing" in refused.output
     run(export_app, *common, "--out", first, "--stand-ins")
     run(train_app, "guided", *common, "--batch-size", 2, "--guide", first)
     run(export_app, *common, "--out", whole, "--beside", first)
