@@ -13,12 +13,16 @@ from rich.markup import escape
 
 from models_export.data.real import RealData
 from models_export.edge import edge_recipe
+from models_export.guided import export_guided, train_guided
 from models_export.packing import ExportOptions, export
+from models_export.paper import paper_recipe
 from models_export.recipe import PackRecipe, train
 from models_export.train.config import TrainConfig
+from models_export.train.guided import GuidedTask
 from service.errors import InputError, QuadliftError
 
 ALL = "all"
+GUIDED = GuidedTask.name
 train_app = typer.Typer(add_completion=False)
 export_app = typer.Typer(add_completion=False)
 console = Console()
@@ -28,6 +32,7 @@ class PackName(StrEnum):
     """Packs that can be trained."""
 
     EDGE = "edge"
+    PAPER = "paper"
 
 
 class PrecisionName(StrEnum):
@@ -38,7 +43,7 @@ class PrecisionName(StrEnum):
     INT8 = "int8"
 
 
-NetworkArgument = Annotated[str, typer.Argument(help="A network of the pack (detector, multibin, depth), or 'all'.")]
+NetworkArgument = Annotated[str, typer.Argument(help="detector, multibin or depth; 'all' of these; or guided.")]
 PackOption = Annotated[PackName, typer.Option("--pack", help="Whose networks.")]
 DataOption = Annotated[list[Path], typer.Option("--data", help="Data set: a folder of scenes. Repeatable.")]
 RunsOption = Annotated[Path | None, typer.Option(help="Folder of checkpoints, logs and curves; runs/<pack> if left out.")]
@@ -61,10 +66,13 @@ def train_command(
     ] = None,
     device: Annotated[str, typer.Option(help="torch device: cpu, cuda, ...")] = "cpu",
     threads: Annotated[int, typer.Option(help="CPU threads of the arithmetic.")] = 1,
-    workers: Annotated[int, typer.Option(help="Batches prepared at the same time.")] = 1,
-    amp: Annotated[bool, typer.Option(help="Mixed precision (bfloat16).")] = True,
+    workers: Annotated[int | None, typer.Option(help="Batches prepared at the same time; the recipe's if left out.")] = None,
+    amp: Annotated[
+        bool | None, typer.Option("--amp/--no-amp", help="Mixed precision (bfloat16); the recipe's if left out.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of weights, data order and augmentation.")] = 1,
     init: Annotated[Path | None, typer.Option(help="File or folder of weights to start from.")] = None,
+    guide: Annotated[str, typer.Option(help="Pack whose depth net guides the network 'guided': a name, or a folder.")] = "edge",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint.")] = False,
 ) -> None:
     """Train networks of a pack on scenes: checkpoint, log and loss curves go to --runs."""
@@ -76,6 +84,10 @@ def train_command(
         changes |= {"steps": steps, "epochs": epochs}
     recipe = _recipe(pack)
     try:
+        if network == GUIDED:
+            guided = replace(recipe.guided, training=_changed(recipe.guided.training, changes))
+            train_guided(data, guide, runs or _runs(pack), guided, init=init, resume=resume)
+            return
         names = recipe.names if network == ALL else (recipe.network(network).name,)
         if init is not None and network == ALL:
             raise InputError("is for one network.", field="init", remedy="Train the networks one by one.")
@@ -97,13 +109,24 @@ def export_command(
     precision: Annotated[PrecisionName | None, typer.Option(help="Of all networks; the recipe's if left out.")] = None,
     fp32: Annotated[list[str] | None, typer.Option("--fp32", help="Keep this network in float. Repeatable.")] = None,
     batch: Annotated[str, typer.Option(help="Images a run: 'dynamic', or a number that every run has.")] = "dynamic",
+    stand_ins: Annotated[
+        bool, typer.Option("--stand-ins", help="Export a detector that finds too little to measure errors on.")
+    ] = False,
+    beside: Annotated[str | None, typer.Option(help="Export 'guided' alone, into a copy of this pack.")] = None,
 ) -> None:
-    """Export trained networks to a pack: checked against torch, measured on validation scenes, with a manifest."""
+    """Export trained networks to a pack: checked against torch, measured on validation scenes, with a manifest.
+
+    The depth-guided detector too, when --runs has it.
+    """
+    runs = runs or _runs(pack)
     try:
         recipe = _recipe(pack)
         keep = tuple(recipe.network(name).name for name in fp32 or ())
-        options = ExportOptions(precision.value if precision else None, keep, _batch(batch))
-        manifest = export(recipe, runs or _runs(pack), data, out, options, console)
+        options = ExportOptions(precision.value if precision else None, keep, _batch(batch), stand_ins)
+        if beside is None:
+            manifest = export(recipe, runs, data, out, options, console)
+        if beside is not None or (runs / f"{GUIDED}.pt").is_file():
+            manifest = export_guided(runs, data, beside or str(out), out, recipe.guided, console)
     except QuadliftError as error:
         raise _failed(error) from None
     size = sum((out / entry.file).stat().st_size for entry in manifest.networks.values())
@@ -111,7 +134,7 @@ def export_command(
 
 
 def _recipe(pack: PackName) -> PackRecipe:
-    return {PackName.EDGE: edge_recipe}[pack]()
+    return {PackName.EDGE: edge_recipe, PackName.PAPER: paper_recipe}[pack]()
 
 
 def _recordings(folder: Path | None, taught: Path | None) -> RealData | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from models_export.data.real import RealData
+from models_export.guided import GuidedRecipe
 from models_export.metadata import depth_metadata, detector_metadata, uncertain_multibin_metadata
 from models_export.nets.depth import DepthConfig, EdgeDepth
 from models_export.nets.detector import DetectorConfig, EdgeDetector
@@ -15,7 +16,10 @@ from models_export.train.multibin import MultibinTask
 
 
 def edge_recipe(
-    detector: DetectorConfig | None = None, multibin: MultibinConfig | None = None, depth: DepthConfig | None = None
+    detector: DetectorConfig | None = None,
+    multibin: MultibinConfig | None = None,
+    depth: DepthConfig | None = None,
+    guided: GuidedRecipe | None = None,
 ) -> PackRecipe:
     """The pack as it is shipped, or with networks of other shapes."""
     return PackRecipe(
@@ -26,6 +30,7 @@ def edge_recipe(
             _multibin(multibin or MultibinConfig()),
             _depth(depth or DepthConfig()),
         ),
+        guided=guided or GuidedRecipe(),
     )
 
 

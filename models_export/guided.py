@@ -1,8 +1,8 @@
-"""The recipe of the depth-guided detector: trained beside a pack's depth net, and added to that pack."""
+"""The depth-guided detector: its recipe, its training beside a pack's depth net, and its export into that pack."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -21,14 +21,14 @@ from models_export.export import MAX_TILES, Exported, trace, with_metadata, writ
 from models_export.guided_losses import GuidedLossConfig
 from models_export.guided_scores import measure
 from models_export.nets.blocks import parameter_count
-from models_export.nets.guided import OUTPUTS, EdgeGuided, GuidedConfig
-from models_export.train.checkpoint import load_averaged, read_checkpoint
+from models_export.nets.guided import OUTPUTS, EdgeGuided, GuidedConfig, ResNetGuided
+from models_export.train.checkpoint import load_averaged, load_checkpoint, read_checkpoint
 from models_export.train.config import TrainConfig
 from models_export.train.guided import GuidedTask
 from models_export.train.guided_targets import AssignConfig
 from models_export.train.loop import fit
 from models_export.verify import require_parity
-from service.nets.canvas import ALIGN_PX
+from service.nets.canvas import ALIGN_PX, PADDED, InputFit
 from service.nets.depth import DepthNet
 from service.nets.guided import GuidedDetector, GuidedSpec
 from service.nets.pack import Manifest, Pack, load_pack, open_network
@@ -41,30 +41,43 @@ class GuidedRecipe:
     """Everything that decides the weights, data aside; the defaults are the edge size's."""
 
     net: GuidedConfig = field(default_factory=GuidedConfig)
+    build: Callable[[GuidedConfig], EdgeGuided | ResNetGuided] = EdgeGuided
+    """The network of a configuration."""
     assign: AssignConfig = field(default_factory=lambda: AssignConfig(best_iou=0.2, background_iou=0.4))
     """Roadside vehicles are small: at least one anchor answers for each, and near misses are not blamed."""
     loss: GuidedLossConfig = field(default_factory=lambda: GuidedLossConfig(gamma=2.0))
     """Gamma 2, for no anchors are left out of the background here, and most are easy."""
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     noise: GuideNoise = field(default_factory=GuideNoise)
-    training: TrainConfig = field(default_factory=lambda: TrainConfig(steps=2000, batch_size=8, ema_decay=0.995, amp=False))
-
-
-def train_guided(data: Sequence[Path], pack: str, out: Path, recipe: GuidedRecipe, *, resume: bool = False) -> nn.Module:
-    """Train the edge size on the training scenes of ``data``, guided by the maps of the pack's own depth net.
-
-    Checkpoint, log and curve go to ``out``. Raises InputError for too little data, PackError for an unusable pack.
-    """
-    training, _ = split_scenes(data)
-    frames = _frames(training, DepthNet(load_pack(pack).networks["depth"]), recipe)[1]
-    task = GuidedTask(
-        frames, EdgeGuided(recipe.net), assign=recipe.assign, loss=recipe.loss, augment=recipe.augment, noise=recipe.noise
+    load_pretrained: Callable[[Any, Path], None] = load_checkpoint
+    """Puts the weights of a user's file into the network."""
+    training: TrainConfig = field(
+        default_factory=lambda: TrainConfig(steps=4000, batch_size=8, learning_rate=6e-3, ema_decay=0.995, amp=False)
     )
-    return fit(task, recipe.training, out, resume=resume)
+
+
+def train_guided(
+    data: Sequence[Path], pack: str, out: Path, recipe: GuidedRecipe, *, init: Path | None = None, resume: bool = False
+) -> nn.Module:
+    """Train on the training scenes of ``data``, guided by the maps of the pack's own depth net.
+
+    Checkpoint, logs and curves go to ``out``. init: weights to start from; not read when resuming. Raises InputError for too
+    little data and weights that do not fit, PackError for an unusable pack.
+    """
+    depth = DepthNet(load_pack(pack).networks["depth"])
+    training, held_out = (_frames(scenes, depth, recipe)[1] for scenes in split_scenes(data))
+    # Before the network is made: its first weights are drawn.
+    torch.manual_seed(recipe.training.seed)
+    net = recipe.build(recipe.net)
+    task = GuidedTask(training, net, assign=recipe.assign, loss=recipe.loss, augment=recipe.augment, noise=recipe.noise)
+    if init is not None and not resume:
+        recipe.load_pretrained(net, init)
+    config = replace(recipe.training, init=None if init is None else init.name)
+    return fit(task, config, out, task.held_out(held_out), resume=resume)
 
 
 def _frames(scenes: Sequence[Path], depth: DepthNet, recipe: GuidedRecipe) -> tuple[list[Sample], list[GuidedFrame]]:
-    samples = load_samples(scenes, recipe.net.classes, recipe.net.max_width, depth.stride)
+    samples = load_samples(scenes, recipe.net.classes, recipe.net.max_width, recipe.net.guide_stride)
     return samples, guided_frames(samples, depth)
 
 
@@ -77,13 +90,16 @@ def export_guided(
     """
     base = load_pack(pack)
     state = read_checkpoint(runs / f"{GuidedTask.name}.pt")
-    net = load_averaged(runs / f"{GuidedTask.name}.pt", EdgeGuided(recipe.net))[0]
-    spec = GuidedSpec.from_metadata(state["task"]["spec"])
-    model = guided_onnx(net, recipe.net)
+    net = load_averaged(runs / f"{GuidedTask.name}.pt", recipe.build(recipe.net))[0]
     samples, frames = _frames(split_scenes(data)[1], DepthNet(base.networks["depth"]), recipe)
-    inputs = [real_inputs(spec, frames[:_PARITY_FRAMES]), real_inputs(spec, frames[:1], cut=True)]
-    difference = require_parity(net, open_network(GuidedTask.name, with_metadata(model, spec.to_metadata())), inputs)
-    errors = measure(GuidedDetector(open_network(GuidedTask.name, with_metadata(model, spec.to_metadata()))), samples, frames)
+    spec = replace(GuidedSpec.from_metadata(state["task"]["spec"]), fit=fit_of(net, frames))
+    model = guided_onnx(net, recipe.net, frames[0].canvas.shape[:2])
+    network = open_network(GuidedTask.name, with_metadata(model, spec.to_metadata()))
+    inputs = [real_inputs(spec, frames[:_PARITY_FRAMES])]
+    if isinstance(net, EdgeGuided):
+        inputs.append(real_inputs(spec, frames[:1], cut=True))
+    difference = require_parity(net, network, inputs)
+    errors = measure(GuidedDetector(network), samples, frames)
     spec = replace(spec, sigma_scale=errors.sigma_scale)
     scores = {"parity_with_torch": float(f"{difference:.2e}"), **errors.scores}
     (console or Console()).print(GuidedTask.name, scores)
@@ -92,20 +108,29 @@ def export_guided(
     return add_to_pack(base, out, added, provenance, scores)
 
 
-def guided_onnx(net: nn.Module, config: GuidedConfig) -> bytes:
-    """The ONNX file of the edge size: images (B, H, W, 3) uint8 and guides (B, G, H / s, W / s) float32, all but G dynamic."""
-    rows, columns = (Dim(axis, min=1, max=MAX_TILES) for axis in ("rows", "columns"))
+def fit_of(net: nn.Module, frames: Sequence[GuidedFrame]) -> InputFit:
+    """Any canvas for the edge size; for the published one that of the frames."""
+    height, width = frames[0].canvas.shape[:2]
+    return PADDED if isinstance(net, EdgeGuided) else InputFit((width, height))
+
+
+def guided_onnx(net: nn.Module, config: GuidedConfig, canvas_hw: tuple[int, int]) -> bytes:
+    """The ONNX file: images (B, H, W, 3) uint8 and guides (B, G, H / s, W / s) float32.
+
+    The edge size takes any canvas, in multiples of 32 px; the published one only that of ``canvas_hw``.
+    """
+    height, width = canvas_hw
     cells = ALIGN_PX // config.guide_stride
-    height, width = 6 * ALIGN_PX, 8 * ALIGN_PX
     examples = {
         "images": torch.zeros((2, height, width, 3), dtype=torch.uint8),
         "guides": torch.zeros((2, len(config.guides), height // config.guide_stride, width // config.guide_stride)),
     }
-    shapes = (
-        {0: Dim("batch"), 1: ALIGN_PX * rows, 2: ALIGN_PX * columns},
-        {0: Dim("batch"), 2: cells * rows, 3: cells * columns},
-    )
-    return trace(net, GuidedTask.name, examples, shapes, OUTPUTS[: 4 + config.learned_sigma])
+    images, guides = {0: Dim("batch")}, {0: Dim("batch")}
+    if isinstance(net, EdgeGuided):
+        rows, columns = (Dim(axis, min=1, max=MAX_TILES) for axis in ("rows", "columns"))
+        images |= {1: ALIGN_PX * rows, 2: ALIGN_PX * columns}
+        guides |= {2: cells * rows, 3: cells * columns}
+    return trace(net, GuidedTask.name, examples, (images, guides), OUTPUTS[: 4 + config.learned_sigma])
 
 
 def real_inputs(spec: GuidedSpec, frames: Sequence[GuidedFrame], *, cut: bool = False) -> tuple[NDArray[np.uint8], Map]:

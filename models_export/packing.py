@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from models_export.quantize import quantize
 from models_export.recipe import NetworkRecipe, PackRecipe, Precision, resolved_config
 from models_export.train.checkpoint import load_averaged, read_checkpoint
 from models_export.validate import (
+    TooFewVehiclesError,
     depth_scores,
     detect_all,
     detector_scores,
@@ -31,6 +32,7 @@ from models_export.validate import (
     image_of,
     match_all,
     multibin_scores,
+    reading_error,
 )
 from models_export.verify import require_parity
 from service.nets.canvas import PADDED, InputFit
@@ -57,6 +59,9 @@ class ExportOptions:
     """Networks that stay in fp32 whatever ``precision`` says."""
     batch: int | None = None
     """Images of every run; the service fills up smaller batches. None: any number."""
+    stand_ins: bool = False
+    """Export although the detector finds too few vehicles to measure errors on; ``UNMEASURED`` values stand for them then, and
+    the manifest says so."""
 
     def precision_of(self, network: NetworkRecipe) -> Precision:
         """The precision of a network."""
@@ -73,7 +78,8 @@ def export(
 ) -> Manifest:
     """Export the trained networks of ``runs`` to a pack in ``out``, checked, and measured on the validation scenes of ``data``.
 
-    Raises PackError when torch and ONNX Runtime disagree, InputError when a checkpoint is missing.
+    Raises PackError when torch and ONNX Runtime disagree, InputError when a checkpoint is missing, TooFewVehiclesError when the
+    detector finds too little to measure anything on.
     """
     console = console or Console()
     training, validation = split_scenes(data)
@@ -131,7 +137,8 @@ class _Job:
         """The detector, and what it finds on the validation frames."""
         draft = self._frame_draft("detector")
         found = detect_all(Detector(draft.open()), self.samples)
-        measured = {"sigma_edge_px": edge_errors(match_all(found, self.samples)).to_metadata()}
+        matches = match_all(found, self.samples)
+        measured = self._measured("detector", lambda: {"sigma_edge_px": edge_errors(matches).to_metadata()})
         self._finish(draft, measured, detector_scores(found, self.samples) | measured)
         return found
 
@@ -139,7 +146,8 @@ class _Job:
         """The multi-bin head, measured on detected boxes."""
         config = self.recipe.network("multibin").config
         draft = self._draft("multibin", _crop_batches(self.samples, config)[:4], _crop_batches(self.calibration, config))
-        scores = multibin_scores(Multibin(draft.open()), match_all(found, self.samples))
+        head, matches = Multibin(draft.open()), match_all(found, self.samples)
+        scores = self._measured("multibin", lambda: multibin_scores(head, matches))
         # A head that predicts its deviations has a scale of them to be measured besides.
         measured = [key for key in UNMEASURED["multibin"] | draft.metadata if key in scores]
         self._finish(draft, {key: scores[key] for key in measured}, scores)
@@ -147,8 +155,18 @@ class _Job:
     def depth(self, found: list[Detections]) -> None:
         """The depth net, measured in detected boxes."""
         draft = self._frame_draft("depth")
-        scores = depth_scores(DepthNet(draft.open()), self.samples, match_all(found, self.samples))
-        self._finish(draft, {key: scores[key] for key in UNMEASURED["depth"]}, scores)
+        scores, errors = depth_scores(DepthNet(draft.open()), self.samples, match_all(found, self.samples))
+        measured = self._measured("depth", lambda: reading_error(errors))
+        self._finish(draft, measured, scores | measured)
+
+    def _measured(self, name: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """What is measured of a network on detected vehicles, or stand-ins where there are too few and the options allow it."""
+        try:
+            return measure()
+        except TooFewVehiclesError:
+            if not self.options.stand_ins:
+                raise
+        return UNMEASURED[name] | {"stand_ins": True}
 
     def _frame_draft(self, name: str) -> _Draft:
         """The draft of a network that sees whole frames."""
@@ -202,7 +220,7 @@ def _image_batches(samples: list[Sample], fit: InputFit) -> list[Images]:
 def _crop_batches(samples: list[Sample], config: Any) -> list[Images]:
     vehicles = [vehicle for sample in samples for vehicle in vehicles_of(sample, config.max_width)]
     crops = np.stack([vehicle.crop(vehicle.xyxy_px, config.crop_px)[0] for vehicle in vehicles])
-    return [crops[i : i + _CROPS] for i in range(0, len(crops) - _CROPS + 1, _CROPS)]
+    return [crops[i : i + _CROPS] for i in range(0, max(len(crops) - _CROPS, 0) + 1, _CROPS)]
 
 
 def _data_description(root: Path) -> dict[str, Any]:

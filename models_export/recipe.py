@@ -13,7 +13,8 @@ from torch import nn
 from models_export.data.detection import DetectionSample
 from models_export.data.real import RealData
 from models_export.data.samples import Sample, load_samples, split_scenes
-from models_export.train.checkpoint import load_averaged
+from models_export.guided import GuidedRecipe
+from models_export.train.checkpoint import load_checkpoint
 from models_export.train.config import TrainConfig
 from models_export.train.loop import fit
 from models_export.train.task import Task
@@ -27,17 +28,6 @@ class SampleTask(Task, Protocol):
 
     def held_out(self, samples: Sequence[Any]) -> Task:
         """The same network and configuration over other samples, which are not augmented: for validation."""
-
-
-def load_checkpoint(net: nn.Module, path: Path) -> None:
-    """Start from the averaged weights of an earlier run's checkpoint. Raises InputError when they do not fit."""
-    try:
-        load_averaged(path, net)
-    except (RuntimeError, KeyError) as error:
-        raise InputError(
-            f"holds no weights of this network: {error}", field=str(path), remedy="Give its checkpoint."
-        ) from error
-    net.train()
 
 
 def unchanged(net: nn.Module) -> nn.Module:
@@ -87,6 +77,8 @@ class PackRecipe:
     version: str
     networks: tuple[NetworkRecipe, ...]
     """In the order in which they are trained and exported; the detector first, for the others are measured on its boxes."""
+    guided: GuidedRecipe
+    """Of the depth-guided detector. It is trained and exported after the others, for it learns beside a pack's depth net."""
 
     @property
     def names(self) -> tuple[str, ...]:

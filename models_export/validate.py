@@ -36,6 +36,15 @@ _MIN_ERRORS = 4 * _SCORE_BINS * _SIZE_BINS
 _MIN_CUT = 30
 
 
+class TooFewVehiclesError(InputError):
+    """The detector finds too few of the validation scenes' vehicles to measure anything on them."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "the detector finds next to nothing on the validation scenes.", field="detector", remedy="Train it longer."
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Matched:
     """Detections of one sample matched with its vehicles."""
@@ -109,13 +118,11 @@ def fit_error_model(error: Array, score: Array, is_cut: NDArray[np.bool_], size:
     """The error model of absolute errors (N,) on detections of scores (N,), cut or not (N,), of sizes (N,).
 
     Fitted to the 68th percentile of the errors in bins of score (and size), which a few gross errors do not move. Raises
-    InputError when there are too few errors to measure anything.
+    TooFewVehiclesError when there are too few errors to measure anything.
     """
     whole = np.flatnonzero(~is_cut)
     if len(whole) < _MIN_ERRORS:
-        raise InputError(
-            "the detector finds next to nothing on the validation scenes.", field="detector", remedy="Train it longer."
-        )
+        raise TooFewVehiclesError
     sizes = np.zeros_like(error) if size is None else size
     rows = []
     for by_score in np.array_split(whole[np.argsort(score[whole])], _SCORE_BINS):
@@ -139,7 +146,10 @@ def fit_error_model(error: Array, score: Array, is_cut: NDArray[np.bool_], size:
 
 
 def edge_errors(matches: Sequence[Matched]) -> ErrorModel:
-    """The error model of box edges, px. Edges at the border itself are left out: lifting does not read them."""
+    """The error model of box edges, px. Edges at the border itself are left out: lifting does not read them.
+
+    Raises TooFewVehiclesError.
+    """
     error, score, is_cut, size = [], [], [], []
     for m in matches:
         at_border = cut_edges(m.sample.camera, m.xyxy_px)
@@ -155,9 +165,11 @@ def multibin_scores(multibin: Multibin, matches: Sequence[Matched]) -> dict[str,
     """Errors of angle and size on detected boxes: medians, flips, and the error models that lifting uses.
 
     Of a head that predicts edges and standard deviations, also the edges' errors and ``sigma_scale``: what makes the predicted
-    deviations cover 68 % of the errors.
+    deviations cover 68 % of the errors. Raises TooFewVehiclesError.
     """
     rows = [_head_errors(multibin, m) for m in matches if len(m.truth)]
+    if not rows:
+        raise TooFewVehiclesError
     error, sigma = np.concatenate([row.error for row in rows]), np.concatenate([row.sigma for row in rows])
     flipped, is_cut = np.concatenate([row.flipped for row in rows]), np.concatenate([row.is_cut for row in rows])
     score = np.concatenate([row.score for row in rows])
@@ -224,12 +236,13 @@ def _azimuth(camera: Camera, xyxy_px: Array) -> Array:
     return ray_azimuth(camera, (xyxy_px[:, :2] + xyxy_px[:, 2:]) / 2)
 
 
-def depth_scores(depth: DepthNet, samples: Sequence[Sample], matches: Sequence[Matched]) -> dict[str, float]:
-    """Errors of the depth net.
+def depth_scores(
+    depth: DepthNet, samples: Sequence[Sample], matches: Sequence[Matched]
+) -> tuple[dict[str, float], NDArray[np.float64]]:
+    """Errors of the depth net: of its maps, and (N,) relative ones of what the service reads in detected boxes.
 
-    ``abs_rel`` and ``delta_1.25`` (percent) over all cells after the least-squares scale and shift of each image;
-    ``bias_relative`` and ``sigma_relative``: median relative error of what the service reads in detected boxes, with the scale
-    that it fits on the road, and the 68th percentile about it. The map blurs a vehicle into the road behind it.
+    ``abs_rel`` and ``delta_1.25`` (percent) over all cells after the least-squares scale and shift of each image. Boxes are
+    read with the scale that the service fits on the road.
     """
     errors, within, readings = [], [], [np.zeros(0)]
     for sample, m in zip(samples, matches, strict=True):
@@ -240,13 +253,21 @@ def depth_scores(depth: DepthNet, samples: Sequence[Sample], matches: Sequence[M
         errors.append(float(np.mean(np.abs(ratio - 1))))
         within.append(float(np.mean(np.maximum(ratio, 1 / ratio) < 1.25)))
         readings.append(_reading_errors(ours, truth, sample, m))
-    every = np.concatenate(readings)
-    bias = float(np.median(every)) if len(every) else 0.0
+    scores = {"abs_rel": round(float(np.mean(errors)), 4), "delta_1.25": round(100 * float(np.mean(within)), 2)}
+    return scores, np.concatenate(readings)
+
+
+def reading_error(errors: NDArray[np.float64]) -> dict[str, float]:
+    """Median of relative errors (N,) of readings, and the 68th percentile about it. Raises TooFewVehiclesError for none.
+
+    The map blurs a vehicle into the road behind it.
+    """
+    if not len(errors):
+        raise TooFewVehiclesError
+    bias = float(np.median(errors))
     return {
-        "abs_rel": round(float(np.mean(errors)), 4),
-        "delta_1.25": round(100 * float(np.mean(within)), 2),
         "bias_relative": round(bias, 4),
-        "sigma_relative": round(float(np.percentile(np.abs((1 + every) / (1 + bias) - 1), _NORMAL_68)), 4),
+        "sigma_relative": round(float(np.percentile(np.abs((1 + errors) / (1 + bias) - 1), _NORMAL_68)), 4),
     }
 
 

@@ -23,6 +23,7 @@ from service.geometry.ground import Ground
 from service.geometry.transforms import Array
 from service.guided_boxes import join, on_the_road, suppress_bev, world_boxes
 from service.hardness import HardnessSettings, hardness_of
+from service.measuring import Still
 from service.nets.depth import InverseDepth
 from service.nets.detections import Detections
 from service.nets.guided import GuidedDetector, guide_maps, metric_map
@@ -40,8 +41,9 @@ class GuidanceSettings:
 
     hardness: HardnessSettings = field(default_factory=HardnessSettings)
     """When ``auto`` takes a camera's view for hard."""
-    score_threshold: float = 0.3
-    """Guided boxes of a lower score are dropped."""
+    score_threshold: float = 0.45
+    """Guided boxes of a lower score are dropped. On held-out training scenes a lower one costs more precision than it gains
+    recall (docs/hard-mode.md)."""
     nms_iou: float = 0.4
     """2D boxes that overlap a better one by more are dropped."""
     duplicate_iou: float = 0.1
@@ -62,12 +64,11 @@ class GuidanceSettings:
 class View:
     """What is known of one camera's frame before the hard path."""
 
-    camera: Camera
-    """At the image's size."""
-    image: UInt8Image
+    still: Still
     detections: Detections
-    """2D detections."""
+    """2D detections, in px of the still's ``small``."""
     inverse: InverseDepth
+    """Of the still's ``small``."""
     scale: DepthScale | None
     """Makes the map metric; None where it cannot be."""
 
@@ -81,7 +82,7 @@ class Guidance:
         self.settings = settings
         self._classes = _class_map(detector.spec.classes, classes)
         # Weak keys: a camera that left takes its road with it. Written twice at worst, with the same values.
-        self._roads: WeakKeyDictionary[Camera, tuple[tuple[int, ...], Array]] = WeakKeyDictionary()
+        self._roads: WeakKeyDictionary[Camera, tuple[tuple[int, int], Array]] = WeakKeyDictionary()
 
     @staticmethod
     def of(pack: Pack, mode: HardMode, settings: GuidanceSettings) -> Guidance | None:
@@ -97,7 +98,7 @@ class Guidance:
             raise PackError(
                 f"pack '{pack.manifest.name}' has no network 'guided'.",
                 field="hard_mode",
-                remedy="Use hard_mode auto or never, or add one: quadlift guided train, quadlift guided export.",
+                remedy="Use hard_mode auto or never, or add one: quadlift train guided, quadlift export.",
             )
         logger.info("Pack '%s' has no network 'guided': hard_mode auto is never.", pack.manifest.name)
         return None
@@ -107,14 +108,13 @@ class Guidance:
         if self.mode == "always":
             return np.ones(len(views), dtype=bool)
         chosen = self.settings.hardness
-        hard = [hardness_of(view.image, view.detections.xyxy_px, chosen).is_hard(chosen) for view in views]
+        hard = [hardness_of(view.still.small, view.detections.xyxy_px, chosen).is_hard(chosen) for view in views]
         return np.array(hard, dtype=bool)
 
     def add(
         self,
         views: Sequence[View],
         hard: NDArray[np.bool_],
-        site_cameras: Sequence[Camera],
         ground: Ground,
         lifted: Boxes,
         camera_index: Index,
@@ -122,13 +122,12 @@ class Guidance:
     ) -> tuple[Boxes, Index]:
         """Boxes of all cameras, and their cameras (N,), after guided boxes joined those of the ``hard`` (C,) ones.
 
-        site_cameras: the site's own objects of the views' cameras, which keep what is known of their roads. With method
-        ``paper`` guided boxes take the place of lifted ones, as the paper has it, and know nothing of the road.
+        With method ``paper`` guided boxes take the place of lifted ones, as the paper has it, and know nothing of the road.
         """
         if not hard.any():
             return lifted, camera_index
         chosen = [int(number) for number in np.flatnonzero(hard)]
-        guided = self._boxes([views[c] for c in chosen], [site_cameras[c] for c in chosen], ground, method)
+        guided = self._boxes([views[c] for c in chosen], ground, method)
         settings = self.settings
         parts, owners = [lifted.take(~hard[camera_index])], [camera_index[~hard[camera_index]]]
         for number, own in zip(chosen, guided, strict=True):
@@ -140,31 +139,45 @@ class Guidance:
         order = np.argsort(index, kind="stable")
         return boxes.take(order), index[order]
 
-    def _boxes(self, views: Sequence[View], site_cameras: Sequence[Camera], ground: Ground, method: Method) -> list[Boxes]:
+    def warm_up(self, images: Sequence[UInt8Image]) -> None:
+        """Run the detector once on images (H, W, 3) RGB."""
+        spec, sizes = self.detector.spec, [(image.shape[1], image.shape[0]) for image in images]
+        maps = [guide_maps(spec, size, 1.0, None, np.zeros(spec.guide_grid(size)[0])) for size in sizes]
+        self.detector.detect(images, maps, [1.0] * len(images))
+
+    @property
+    def max_width(self) -> int | None:
+        """Width of the images that the detector wants, px; None: what the 2D detector sees."""
+        size = self.detector.spec.fit.size
+        return None if size is None else size[0]
+
+    def _boxes(self, views: Sequence[View], ground: Ground, method: Method) -> list[Boxes]:
         settings = self.settings
-        focal = [float(view.camera.K[1, 1]) for view in views]
-        maps = [
-            self._maps(view, site, ground, focal_px) for view, site, focal_px in zip(views, site_cameras, focal, strict=True)
-        ]
-        found = self.detector.detect(
-            [view.image for view in views], maps, focal, score_threshold=settings.score_threshold, nms_iou=settings.nms_iou
-        )
+        whole = self.max_width is not None
+        images = [view.still.whole if whole else view.still.small for view in views]
+        cameras = [view.still.whole_camera if whole else view.still.small_camera for view in views]
+        focal = [float(camera.K[1, 1]) for camera in cameras]
+        maps = [self._maps(view, camera, ground) for view, camera in zip(views, cameras, strict=True)]
+        found = self.detector.detect(images, maps, focal, score_threshold=settings.score_threshold, nms_iou=settings.nms_iou)
         boxes = []
-        for view, detections in zip(views, found, strict=True):
-            own = world_boxes(view.camera, detections, self._classes[detections.cls])
+        for camera, detections in zip(cameras, found, strict=True):
+            own = world_boxes(camera, detections, self._classes[detections.cls])
             if method != "paper":
-                own = on_the_road(own, ground, view.camera, settings.ground_sigma_m, settings.ground_sigma_per_m)
+                own = on_the_road(own, ground, camera, settings.ground_sigma_m, settings.ground_sigma_per_m)
             boxes.append(suppress_bev(own, settings.duplicate_iou, settings.duplicate_distance_m))
         return boxes
 
-    def _maps(self, view: View, site_camera: Camera, ground: Ground, focal_px: float) -> NDArray[np.float32]:
-        size, shape = (view.camera.width, view.camera.height), view.inverse.values.shape
-        known = self._roads.get(site_camera)
-        if known is None or known[0] != (*size, *shape):
-            known = (*size, *shape), ground_inverse_depth(view.camera, ground, shape, view.inverse.stride)
-            self._roads[site_camera] = known
-        metric = None if view.scale is None else metric_map(view.inverse, view.scale.scale, view.scale.shift)
-        return guide_maps(self.detector.spec, size, focal_px, metric, known[1])
+    def _maps(self, view: View, camera: Camera, ground: Ground) -> NDArray[np.float32]:
+        """Guides of a view; the camera is at the size of the image that goes with them."""
+        spec, size = self.detector.spec, (camera.width, camera.height)
+        shape, stride = spec.guide_grid(size)
+        known = self._roads.get(view.still.site_camera)
+        if known is None or known[0] != size:
+            known = size, ground_inverse_depth(camera, ground, shape, stride)
+            self._roads[view.still.site_camera] = known
+        inverse = view.inverse.at_width(view.still.small_camera.width, camera.width).on_cells(shape, stride)
+        metric = None if view.scale is None else metric_map(inverse, view.scale.scale, view.scale.shift)
+        return guide_maps(spec, size, float(camera.K[1, 1]), metric, known[1])
 
 
 def _class_map(ours: Sequence[str], packs: Sequence[str]) -> NDArray[np.int64]:

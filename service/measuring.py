@@ -25,7 +25,8 @@ _UNKNOWN_YAW_SIGMA = np.pi / np.sqrt(3.0)
 
 @dataclass(frozen=True, eq=False)
 class Still:
-    """One camera's decoded frame, at two sizes: crops are cut from the larger, detector and depth net see the smaller."""
+    """One camera's decoded frame, at up to three sizes, of which several may be one: detector and depth net see the smallest,
+    crops are cut from ``image``, and ``whole`` is for a depth-guided detector that wants more."""
 
     site_camera: Camera
     """The site's camera, at the size of its frames."""
@@ -33,6 +34,8 @@ class Still:
     """(H, W, 3) RGB."""
     small: UInt8Image
     """(h, w, 3) RGB; the same picture, or the same array."""
+    whole: UInt8Image
+    """The same picture as it was decoded."""
 
     @cached_property
     def camera(self) -> Camera:
@@ -43,6 +46,11 @@ class Still:
     def small_camera(self) -> Camera:
         """The camera at the size of ``small``."""
         return self.site_camera.scaled(self.small.shape[1], self.small.shape[0])
+
+    @cached_property
+    def whole_camera(self) -> Camera:
+        """The camera at the size of ``whole``."""
+        return self.site_camera.scaled(self.whole.shape[1], self.whole.shape[0])
 
     @property
     def scale(self) -> tuple[float, float]:

@@ -105,6 +105,8 @@ class Pipeline:
         self.multibin.estimate(
             cut_crops(images[0], [[0.0, 0.0, 20.0, 20.0]], self.multibin.spec.crop_px), np.zeros(1, np.int64)
         )
+        if self.guidance is not None:
+            self.guidance.warm_up(images)
 
     def run(self, frame_set: FrameSet) -> SetResult:
         """All steps for one set. Raises the first FrameError when not one frame can be decoded."""
@@ -168,11 +170,10 @@ class Pipeline:
     ) -> tuple[Boxes, NDArray[np.int64], frozenset[str]]:
         """Boxes and their cameras after the hard path, and the cameras that took it."""
         rows = zip(stills, found, maps, strict=True)
-        views = [View(still.small_camera, still.small, own, *depth) for still, own, depth in rows]
+        views = [View(still, own, *depth) for still, own, depth in rows]
         hard = guidance.hard_views(views)
-        cameras = [still.site_camera for still in stills]
-        lifted, index = guidance.add(views, hard, cameras, site.ground, lifted, index, self.settings.method)
-        return lifted, index, frozenset(camera.id for camera, is_hard in zip(cameras, hard, strict=True) if is_hard)
+        lifted, index = guidance.add(views, hard, site.ground, lifted, index, self.settings.method)
+        return lifted, index, frozenset(still.camera.id for still, is_hard in zip(stills, hard, strict=True) if is_hard)
 
     def _fuse(
         self, lifted: Boxes, terms: BoxProblem | None, camera_index: NDArray[np.int64], cameras: list[Camera]
@@ -191,7 +192,8 @@ class Pipeline:
     def _decode(self, frame_set: FrameSet) -> tuple[list[Still], dict[str, FrameError]]:
         stills, failed = [], {}
         small_width = self.detector.spec.max_width
-        width = max(self.multibin.spec.max_width or 0, small_width)
+        crop_width = max(self.multibin.spec.max_width or 0, small_width)
+        width = max(crop_width, self.guidance.max_width or 0) if self.guidance is not None else crop_width
         for frame in frame_set.frames:
             camera = frame_set.site.camera(frame.camera_id)
             try:
@@ -199,7 +201,7 @@ class Pipeline:
             except FrameError as error:
                 failed[camera.id] = error
                 continue
-            stills.append(Still(camera, image, reduced(image, small_width)))
+            stills.append(Still(camera, reduced(image, crop_width), reduced(image, small_width), image))
         if failed and not stills:
             raise next(iter(failed.values()))
         return stills, failed

@@ -29,6 +29,8 @@ class GuidedFrame:
 
     canvas: NDArray[np.uint8]
     """(H, W, 3) RGB."""
+    labels: dict[str, str]
+    """Camera and weather, for validation."""
     image_size: tuple[int, int]
     """Width and height of the image inside the canvas, px."""
     K: Array
@@ -73,7 +75,10 @@ NO_GUIDE_NOISE = GuideNoise(0.0, 0.0, 0.0)
 
 
 def guided_frames(samples: Sequence[Sample], depth: DepthNet) -> list[GuidedFrame]:
-    """Frames of samples, with the maps of a pack's depth net, scaled on the road as the service scales them."""
+    """Frames of samples, with the maps of a pack's depth net, scaled on the road as the service scales them.
+
+    All maps are at the stride of the samples' inverse depth.
+    """
     return [_frame(sample, depth) for sample in samples]
 
 
@@ -83,12 +88,15 @@ def _frame(sample: Sample, depth: DepthNet) -> GuidedFrame:
     center_px, depth_m = camera.project(sample.center)
     yaw = sample.alpha + ray_azimuth(camera, (sample.xyxy_px[:, :2] + sample.xyxy_px[:, 2:]) / 2)
     (inverse,) = depth.infer([np.ascontiguousarray(sample.canvas[:height, :width])])
-    road = ground_inverse_depth(camera, sample.ground, inverse.values.shape, depth.stride)
-    scale = fit_scale(inverse.values, road)
-    ground = np.nan_to_num(road).astype(np.float32)
-    shape = sample.canvas.shape[0] // depth.stride, sample.canvas.shape[1] // depth.stride
+    scale = fit_scale(inverse.values, ground_inverse_depth(camera, sample.ground, inverse.values.shape, inverse.stride))
+    shape = sample.inverse_depth.shape
+    stride = sample.canvas.shape[0] // shape[0]
+    seen = -(-height // stride), -(-width // stride)
+    inverse = inverse.on_cells(seen, stride)
+    ground = np.nan_to_num(ground_inverse_depth(camera, sample.ground, seen, stride)).astype(np.float32)
     return GuidedFrame(
         canvas=sample.canvas,
+        labels=sample.labels,
         image_size=sample.image_size,
         K=camera.K,
         R_cam_world=camera.R_cam_world,
@@ -110,7 +118,7 @@ def frame_maps(spec: GuidedSpec, frame: GuidedFrame) -> Map:
     return guide_maps(spec, frame.image_size, abs(float(frame.K[1, 1])), frame.metric, frame.ground)
 
 
-def _padded(values: Array | Map, shape: tuple[int, int]) -> Map:
+def _padded(values: Array | Map, shape: tuple[int, ...]) -> Map:
     whole = np.zeros(shape, np.float32)
     whole[: values.shape[0], : values.shape[1]] = values
     return whole

@@ -37,20 +37,26 @@ def local_filter(product: Tensor, dilation: int) -> Tensor:
     return total / _TAPS
 
 
+def pool_3x3(x: Tensor) -> Tensor:
+    """Adaptive max pooling (B, C, H, W) to (B, C, 3, 3), in operators that ONNX has; H and W of a traced graph are fixed."""
+    rows, columns = ([slice(size * i // 3, -(-size * (i + 1) // 3)) for i in range(3)] for size in x.shape[-2:])
+    return torch.stack([torch.stack([x[..., r, c].amax((2, 3)) for c in columns], -1) for r in rows], -2)
+
+
 class DepthGuidedConvolution(nn.Module):
     """DLCN with adaptive dilation, as published: ReLU(BN(sum over r of w_r * mean over offsets of D * X')).
 
-    The map must be larger than the largest dilation. Fixed input sizes only: adaptive pooling has no ONNX form for others.
+    The map must be larger than the largest dilation. A traced graph takes one input size only, for the adaptive pooling.
     """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.weights = nn.Sequential(nn.AdaptiveMaxPool2d(3), nn.Conv2d(channels, channels * len(DILATIONS), 3))
+        self.weights = nn.Conv2d(channels, channels * len(DILATIONS), 3)
         self.norm = nn.BatchNorm2d(channels)
 
     def forward(self, x: Tensor, depth: Tensor) -> Tensor:
         """Image features and depth features (B, C, H, W) to filtered image features of the same shape."""
-        weights = self.weights(x).unflatten(1, (-1, len(DILATIONS))).softmax(2)
+        weights = self.weights(pool_3x3(x)).unflatten(1, (-1, len(DILATIONS))).softmax(2)
         product = depth * shift_pool(x)
         filtered = [local_filter(product, r) * weights[:, :, k] for k, r in enumerate(DILATIONS)]
         return F.relu(self.norm(torch.stack(filtered).sum(0)))

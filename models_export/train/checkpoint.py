@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,8 @@ import torch
 from torch import nn
 
 from service.errors import InputError
+
+SUFFIX = ".pt"
 
 
 def write_checkpoint(path: Path, contents: Mapping[str, Any]) -> None:
@@ -45,3 +47,26 @@ def load_averaged(checkpoint: Path, net: nn.Module) -> tuple[nn.Module, dict[str
     weights = {key.removeprefix("module."): value for key, value in state["averaged"].items() if key != "n_averaged"}
     net.load_state_dict(weights)
     return net.eval(), state
+
+
+def load_checkpoint(net: nn.Module, path: Path) -> None:
+    """Start from the averaged weights of an earlier run's checkpoint. Raises InputError when they do not fit."""
+    try:
+        load_averaged(path, net)
+    except (RuntimeError, KeyError) as error:
+        raise InputError(
+            f"holds no weights of this network: {error}", field=str(path), remedy="Give its checkpoint."
+        ) from error
+    net.train()
+
+
+def checkpoint_or(read: Callable[[Any, Path], object]) -> Callable[[Any, Path], None]:
+    """What starts a network from an earlier run's checkpoint (``.pt``), or from any other file or folder through ``read``."""
+
+    def load(net: nn.Module, path: Path) -> None:
+        if path.suffix == SUFFIX:
+            load_checkpoint(net, path)
+        else:
+            read(net, path)
+
+    return load

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import asdict
 from typing import Any
 
@@ -11,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from models_export.data.augment import AugmentConfig
-from models_export.data.guided_frames import GuidedFrame, GuideNoise, augmented, frame_maps
+from models_export.data.augment import NO_AUGMENT, AugmentConfig
+from models_export.data.guided_frames import NO_GUIDE_NOISE, GuidedFrame, GuideNoise, augmented, frame_maps
 from models_export.guided_losses import (
     GuidedLossConfig,
     class_loss,
@@ -26,7 +27,7 @@ from models_export.guided_losses import (
 from models_export.nets.guided import EdgeGuided, GuidedConfig, ResNetGuided
 from models_export.train.guided_corners import Viewpoint, corners
 from models_export.train.guided_targets import AssignConfig, Assignment, assign_anchors, encode, fit_spec
-from models_export.train.task import Batch
+from models_export.train.task import Batch, ParameterGroup, decayed_groups, draw_uniform
 from service.nets.guided import GuidedSpec, anchor_boxes
 
 _MEASURED_MAPS = 256
@@ -70,11 +71,25 @@ class GuidedTask:
             "frames": len(self.frames),
         }
 
-    def batch(self, rng: np.random.Generator, size: int) -> Batch:
-        """A batch of frames drawn with equal chances."""
-        return self.batch_of(rng.integers(len(self), size=size), rng)
+    def held_out(self, frames: Sequence[GuidedFrame]) -> GuidedTask:
+        """The same network and anchors over other frames, which are not augmented: for validation."""
+        other = copy(self)
+        other.frames, other.augment, other.noise = frames, NO_AUGMENT, NO_GUIDE_NOISE
+        return other
 
-    def batch_of(self, indices: NDArray[np.int64], rng: np.random.Generator) -> Batch:
+    def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.int64]:
+        """Every frame is as likely as the others."""
+        return draw_uniform(rng, len(self), size)
+
+    def labels(self, index: int) -> dict[str, str]:
+        """Camera and weather of a frame."""
+        return self.frames[index].labels
+
+    def parameter_groups(self, net: nn.Module) -> list[ParameterGroup]:
+        """All of the network at one pace."""
+        return decayed_groups(net)
+
+    def batch(self, indices: NDArray[np.int64], rng: np.random.Generator) -> Batch:
         """images (B, H, W, 3) uint8, guides (B, G, h, w); of P anchors that answer: place (P, 4: image, anchor, row, column),
         cls (P,) with the background as 0, targets (P, 11), alpha (P,); blamed (B, A, h, w); view, for the corner term.
         """
@@ -117,7 +132,7 @@ class GuidedTask:
 
 
 def guided_loss(heads: Sequence[Tensor], batch: Batch, spec: GuidedSpec, config: GuidedLossConfig) -> dict[str, Tensor]:
-    """The loss of raw heads, each (B, A * F, h, w), on a batch of :meth:`GuidedTask.batch_of`."""
+    """The loss of raw heads, each (B, A * F, h, w), on a batch of :meth:`GuidedTask.batch`."""
     grids = [head.unflatten(1, (len(spec.anchors_px), -1)).permute(0, 1, 3, 4, 2) for head in heads]
     at = tuple(batch["place"].T)
     logits, box_2d, box_3d, heading, *learned = (grid[at] for grid in grids)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +22,21 @@ class InverseDepth:
     """(h, w), row and column (i, j) at pixel ((j + 0.5) * stride - 0.5, (i + 0.5) * stride - 0.5) of the image."""
     stride: float
     """Pixels of the image a cell; not whole where the image was scaled to the net's size."""
+
+    def on_cells(self, shape: tuple[int, int], stride: float) -> InverseDepth:
+        """The map on other cells (h, w) of the same image, of ``stride`` px: bilinear, the last cell repeated at the border."""
+        if shape == self.values.shape and stride == self.stride:
+            return self
+        ratio = stride / self.stride
+        # Cell j lies at pixel (j + 0.5) * stride - 0.5.
+        to_ours = np.array([[ratio, 0.0, 0.5 * ratio - 0.5], [0.0, ratio, 0.5 * ratio - 0.5]])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        values = cv2.warpAffine(self.values, to_ours, shape[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        return InverseDepth(np.asarray(values, dtype=np.float32), stride)
+
+    def at_width(self, width: int, new_width: int) -> InverseDepth:
+        """The same map of the image at another size: from ``width`` to ``new_width`` px."""
+        return replace(self, stride=self.stride * new_width / width)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ outputs mean and how depth maps are handed in; training encodes its targets with
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import cv2
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from service.errors import PackError
 from service.geometry.transforms import Array, wrap_angle
-from service.nets.canvas import PADDED, canvas_size
+from service.nets.canvas import PADDED, InputFit, Placement
 from service.nets.decoding import MAX_CANDIDATES
 from service.nets.depth import InverseDepth
 from service.nets.pack import Network
@@ -59,6 +59,8 @@ class GuidedSpec:
     """Canvas pixels a cell of the guides."""
     sigma_scale: Array
     """(7,) real errors of u v depth l w h alpha over the sigmas that the network gives (1 where it gives none)."""
+    fit: InputFit = PADDED
+    """How images become canvases. One of fixed size is for frames of its width; any other takes what the 2D detector sees."""
 
     @staticmethod
     def from_metadata(metadata: dict[str, Any]) -> GuidedSpec:
@@ -77,25 +79,35 @@ class GuidedSpec:
                 guides=tuple(metadata["guides"]),
                 guide_stride=int(metadata["guide_stride"]),
                 sigma_scale=np.array(metadata["sigma_scale"], dtype=np.float64).reshape(7),
+                fit=InputFit.from_metadata(metadata.get("fit")),
             )
             if len(spec.priors) != len(spec.anchors_px) or not (spec.std > 0).all() or not (spec.anchors_px > 0).all():
                 raise ValueError("anchors, priors and deviations do not fit each other")
             if not spec.guides or not set(spec.guides) <= set(GUIDES):
                 raise ValueError(f"guides {spec.guides!r}: one or both of {GUIDES}")
+            if spec.fit.place != "corner":
+                # The cells of a centred image would begin within a cell.
+                raise ValueError("the image lies in the corner of its canvas")
         except (KeyError, TypeError, ValueError) as error:
             raise PackError(f"metadata is incomplete: {error!r}.", field="guided", remedy="Export the pack again.") from error
         return spec
 
     def to_metadata(self) -> dict[str, Any]:
         """The inverse of :meth:`from_metadata`."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values = {f.name: getattr(self, f.name) for f in fields(self)} | {"fit": self.fit.to_metadata()}
         return {
             k: v.tolist() if isinstance(v, np.ndarray) else list(v) if isinstance(v, tuple) else v for k, v in values.items()
         }
 
     def depth_factor(self, focal_px: float) -> float:
-        """What turns depths of a camera of focal length ``focal_px`` into the spec's."""
+        """What turns depths of a camera of focal length ``focal_px``, canvas px, into the spec's."""
         return self.focal_px / focal_px if self.focal_px else 1.0
+
+    def guide_grid(self, image_size: tuple[int, int]) -> tuple[tuple[int, int], float]:
+        """Rows and columns of the guides' cells that an image of this width and height covers, and image pixels a cell."""
+        placement = self.fit.placement(*image_size)
+        width, height = placement.size_px
+        return (-(-height // self.guide_stride), -(-width // self.guide_stride)), self.guide_stride / placement.scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +136,12 @@ class GuidedDetections:
     def __len__(self) -> int:
         return len(self.score)
 
+    def placed(self, placement: Placement) -> GuidedDetections:
+        """Detections on a canvas as they are in the image that lies on it."""
+        sigma = self.sigma / np.array([placement.scale, placement.scale, 1.0, 1.0, 1.0, 1.0, 1.0])
+        boxes, centers = placement.to_image(self.xyxy_px), placement.to_image(self.center_px)
+        return replace(self, xyxy_px=boxes, center_px=centers, sigma=sigma)
+
     def take(self, index: NDArray[np.int64]) -> GuidedDetections:
         """The detections at an index."""
         return GuidedDetections(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
@@ -150,11 +168,12 @@ class GuidedDetector:
         guides: (G, h, w) an image, from :func:`guide_maps`. focal_px: vertical focal length of each image's camera.
         """
         results: dict[int, GuidedDetections] = {}
-        for batch in PADDED.batches(images):
+        for batch in self.spec.fit.batches(images):
             outputs = self.network.run(batch.pixels, np.stack([guides[member] for member in batch.members]))
-            for row, member in enumerate(batch.members):
-                raw = decode_guided([out[row] for out in outputs], self.spec, focal_px[member], score_threshold)
-                results[member] = suppress_guided(raw, nms_iou)
+            for row, (member, placement) in enumerate(zip(batch.members, batch.placements, strict=True)):
+                focal = focal_px[member] * placement.scale
+                raw = decode_guided([out[row] for out in outputs], self.spec, focal, score_threshold)
+                results[member] = suppress_guided(raw, nms_iou).placed(placement)
         return [results[member] for member in range(len(images))]
 
 
@@ -163,17 +182,17 @@ def guide_maps(
 ) -> NDArray[np.float32]:
     """The network's second input (G, H / s, W / s) for one canvas: inverse depths in the spec's camera, 1 / metres.
 
-    image_size: width and height, px. metric: (h, w) the depth net's map made metric, or None where it fits no scale: the road
-    then stands in for it. ground: (h, w) inverse depth of the road; NaN where there is none. Both at ``guide_stride``; cells of
-    the padding are 0, which is infinitely far.
+    image_size: width and height, px. focal_px: the image's. metric: (h, w) the depth net's map made metric, or None where it
+    fits no scale: the road then stands in for it. ground: (h, w) inverse depth of the road; NaN where there is none. Both on
+    the cells of ``guide_grid``; cells of the padding are 0, which is infinitely far.
     """
-    width, height = canvas_size(*image_size)
+    width, height = spec.fit.canvas_size(*image_size)
     maps = np.zeros((len(spec.guides), height // spec.guide_stride, width // spec.guide_stride), np.float32)
     road = np.nan_to_num(ground)
     for channel, name in enumerate(spec.guides):
         values = road if name == "ground" or metric is None else metric
         maps[channel, : values.shape[0], : values.shape[1]] = np.clip(values, 0.0, MAX_INVERSE_DEPTH)
-    return maps / np.float32(spec.depth_factor(focal_px))
+    return maps / np.float32(spec.depth_factor(focal_px * spec.fit.placement(*image_size).scale))
 
 
 def metric_map(inverse: InverseDepth, scale: float, shift: float) -> Array:

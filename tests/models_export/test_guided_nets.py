@@ -58,7 +58,7 @@ def test_the_guided_convolution_equals_its_formula() -> None:
     layer = DepthGuidedConvolution(4).eval()
     x, depth = torch.randn(2, 4, 8, 9), torch.randn(2, 4, 8, 9)
     pooled = F.adaptive_max_pool2d(x, 3)
-    kernel, bias = layer.weights[1].weight, layer.weights[1].bias
+    kernel, bias = layer.weights.weight, layer.weights.bias
     weights = (torch.einsum("bcij,ocij->bo", pooled, kernel) + bias).reshape(2, 4, 3).softmax(2)
     torch.testing.assert_close(weights.sum(2), torch.ones(2, 4))
     summed = sum(naive_filter(depth * shift_pool(x), r) * weights[:, :, k, None, None] for k, r in enumerate(DILATIONS))

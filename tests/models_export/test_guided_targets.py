@@ -30,6 +30,7 @@ def frame_of(
     maps = np.full((HEIGHT // 8, WIDTH // 8), 0.05, np.float32)
     return GuidedFrame(
         canvas=np.full((HEIGHT, WIDTH, 3), 114, np.uint8),
+        labels={"camera": "north"},
         image_size=(WIDTH, HEIGHT),
         K=np.array([[120.0, 0.0, 79.5], [0.0, 120.0, 47.5], [0.0, 0.0, 1.0]]),
         R_cam_world=np.eye(3),

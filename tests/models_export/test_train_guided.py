@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from models_export.data.augment import AugmentConfig
+from models_export.data.augment import NO_AUGMENT
 from models_export.data.dataset import parse_truth
 from models_export.data.guided_frames import NO_GUIDE_NOISE, GuidedFrame, GuideNoise
+from models_export.guided import PAPER_RECIPE
 from models_export.guided_losses import GuidedLossConfig, corner_loss
-from models_export.nets.guided import EdgeGuided, GuidedConfig
+from models_export.nets.guided import EdgeGuided, GuidedConfig, ResNetGuided
 from models_export.train.guided import GuidedTask, guided_loss
 from models_export.train.guided_corners import corners
 from models_export.train.guided_targets import AssignConfig
@@ -29,9 +30,7 @@ from service.nets.guided import decode_guided
 from service.site import load_site
 
 CLIP = Path(__file__).resolve().parents[2] / "clients" / "clip"
-STILL = AugmentConfig(
-    geometric=0.0, flip=0.0, brightness=0.0, contrast=(1.0, 1.0), saturation=(1.0, 1.0), white_balance=0.0, blur=0.0, noise=0.0
-)
+STILL = NO_AUGMENT
 SMALL = GuidedConfig(
     channels=(8, 16, 24, 32, 32), neck=32, anchor_heights_px=(8.0, 14.0, 24.0), learned_sigma=False, focal_px=200.0
 )
@@ -60,8 +59,8 @@ def _frame(camera: Camera, row: int, ground: object, document: dict[str, object]
     road[: shape[0], : shape[1]] = np.nan_to_num(ground_inverse_depth(scaled, ground, shape, 8))  # type: ignore[arg-type]
     small = (xyxy[:, 2:] - xyxy[:, :2]).min(1) < 6
     return GuidedFrame(
-        canvas, (image.shape[1], image.shape[0]), scaled.K, scaled.R_cam_world, xyxy, small, np.zeros(len(xyxy), np.int64),
-        pixels, depth, dims, wrap_angle(yaw - ray_azimuth(scaled, pixels)), road, road, road,
+        canvas, {"camera": camera.id}, (image.shape[1], image.shape[0]), scaled.K, scaled.R_cam_world, xyxy, small,
+        np.zeros(len(xyxy), np.int64), pixels, depth, dims, wrap_angle(yaw - ray_azimuth(scaled, pixels)), road, road, road,
     )  # fmt: skip
 
 
@@ -77,7 +76,7 @@ def test_eight_simulated_frames_are_learned_by_heart(frames: list[GuidedFrame]) 
     # As the training loop does: threads of a machine that has other work wait for each other at these sizes.
     torch.set_num_threads(1)
     task = task_of(frames)
-    batch = task.batch_of(np.arange(8), np.random.default_rng(0))
+    batch = task.batch(np.arange(8), np.random.default_rng(0))
     net = task.net.to(memory_format=torch.channels_last).train()
     optimizer = torch.optim.AdamW(net.parameters(), lr=1e-3)
     steps = 80
@@ -107,7 +106,7 @@ def test_eight_simulated_frames_are_learned_by_heart(frames: list[GuidedFrame]) 
 
 def test_what_is_not_blamed_does_not_matter(frames: list[GuidedFrame]) -> None:
     task = task_of(frames[:2])
-    batch = task.batch_of(np.arange(2), np.random.default_rng(0))
+    batch = task.batch(np.arange(2), np.random.default_rng(0))
     grid = batch["blamed"].shape
     heads = [torch.randn(2, 6 * n, *grid[2:]) for n in (2, 4, 6, 6)]
     asked = batch["blamed"].clone()
@@ -126,7 +125,7 @@ def test_what_is_not_blamed_does_not_matter(frames: list[GuidedFrame]) -> None:
 def test_the_loss_is_least_at_the_truth(frames: list[GuidedFrame], bins: tuple[float, ...]) -> None:
     config = replace(SMALL, bin_centers_rad=bins)
     task = task_of(frames[:2], config, GuidedLossConfig(gamma=2.0, corner=1.0))
-    batch = task.batch_of(np.arange(2), np.random.default_rng(0))
+    batch = task.batch(np.arange(2), np.random.default_rng(0))
     heads = true_heads(task, batch)
     losses = guided_loss(heads, batch, task.spec, task.weights)
     assert losses["total"].item() == pytest.approx(0.0, abs=2e-3)
@@ -161,7 +160,7 @@ def test_corners_of_encoded_boxes_are_the_true_ones(frames: list[GuidedFrame]) -
     for augment in (STILL, mirror):
         task = task_of(frames[:1])
         task.augment = augment
-        batch = task.batch_of(np.array([0]), np.random.default_rng(0))
+        batch = task.batch(np.array([0]), np.random.default_rng(0))
         ours = corners(task.spec, batch["view"], batch["targets"][:, 4:10], batch["alpha"])
         frame = frames[0]
         rays = np.linalg.solve(frame.K, np.c_[frame.center_px, np.ones(len(frame.alpha))].T).T @ frame.R_cam_world
@@ -173,9 +172,25 @@ def test_corners_of_encoded_boxes_are_the_true_ones(frames: list[GuidedFrame]) -
 
 def test_a_disturbed_map_is_another_map(frames: list[GuidedFrame]) -> None:
     task = task_of(frames[:1])
-    still = task.batch_of(np.array([0]), np.random.default_rng(0))["guides"]
+    still = task.batch(np.array([0]), np.random.default_rng(0))["guides"]
     task.noise = GuideNoise(truth=1.0)
-    moved = task.batch_of(np.array([0]), np.random.default_rng(0))["guides"]
+    moved = task.batch(np.array([0]), np.random.default_rng(0))["guides"]
     assert torch.equal(still[:, 1], moved[:, 1])
     assert not torch.allclose(still[:, 0], moved[:, 0])
     assert moved.min() >= 0
+
+
+def test_the_published_size_learns_in_both_branches(frames: list[GuidedFrame]) -> None:
+    torch.manual_seed(0)
+    torch.set_num_threads(1)
+    recipe = PAPER_RECIPE
+    task = GuidedTask(
+        frames[:2], ResNetGuided(recipe.net), assign=AssignConfig(best_iou=0.1), loss=recipe.loss, augment=STILL,
+        noise=recipe.noise,
+    )  # fmt: skip
+    losses = task.loss(task.net, task.batch(np.arange(2), np.random.default_rng(0)))
+    losses["total"].backward()
+    assert torch.isfinite(losses["total"])
+    assert losses["box_3d"].item() > 0
+    for branch in (task.net.image, task.net.depth):
+        assert branch.conv1.weight.grad.abs().max() > 0

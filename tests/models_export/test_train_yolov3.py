@@ -15,7 +15,7 @@ from models_export.darknet_weights import write_weights
 from models_export.data.augment import NO_AUGMENT
 from models_export.data.samples import Sample
 from models_export.nets.yolov3 import Yolov3, Yolov3Config
-from models_export.paper_detector import yolov3_recipe
+from models_export.paper import paper_recipe
 from models_export.recipe import resolved_config
 from models_export.train.checkpoint import load_averaged
 from models_export.train.config import TrainConfig
@@ -107,7 +107,7 @@ def test_a_run_is_described_and_saved(toy_samples: list[Sample], tmp_path: Path)
     loaded, state = load_averaged(tmp_path / "detector.pt", Yolov3(task.config))
     assert state["task"]["net"]["anchors_px"] == task.config.anchors_px
     assert task.config.anchors_px != SMALL.anchors_px
-    assert resolved_config(yolov3_recipe(SMALL), state["task"]["net"]) == task.config
+    assert resolved_config(paper_recipe(SMALL).network("detector"), state["task"]["net"]) == task.config
     for ours, theirs in zip(loaded.state_dict().values(), trained.state_dict().values(), strict=True):
         assert torch.equal(ours, theirs)
 
@@ -117,7 +117,7 @@ def test_training_starts_from_a_backbone(toy_samples: list[Sample], tmp_path: Pa
     taught = Yolov3(replace(SMALL, classes=("a", "b")))
     backbone = 1 + sum(1 + 2 * blocks for blocks in SMALL.residuals)
     write_weights(taught, tmp_path / "backbone.weights", convolutions=backbone)
-    recipe = yolov3_recipe(SMALL)
+    recipe = paper_recipe(SMALL).network("detector")
     net = recipe.task(toy_samples, recipe.config).net
     assert isinstance(net, Yolov3)
     recipe.load_pretrained(net, tmp_path / "backbone.weights")

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from models_export.data.samples import Sample
-from models_export.validate import true_map
+from models_export.validate import Matched, TooFewVehiclesError, edge_errors, multibin_scores, reading_error, true_map
 from service.nets.depth import InverseDepth
+from service.nets.multibin import Multibin
+from service.nets.pack import load_pack
 
 
 def test_the_true_map_is_the_samples_own_at_its_stride(toy_samples: list[Sample]) -> None:
@@ -23,3 +25,20 @@ def test_the_true_map_follows_the_cells_of_another_stride(stride: float, toy_sam
     rows = np.minimum((np.arange(height) + 0.5) * stride / 8, 11.99)
     assert truth.shape == (height, width)
     assert np.all(np.abs(truth - (0.02 + 0.01 * (rows - 0.5))[:, None]) <= 0.005 + 1e-6)
+
+
+def test_nothing_is_measured_on_nothing(toy_samples: list[Sample]) -> None:
+    missed = Matched(toy_samples[0], np.zeros((0, 4)), np.zeros(0), np.zeros(0, np.int64))
+    with pytest.raises(TooFewVehiclesError, match="finds next to nothing"):
+        edge_errors([missed])
+    with pytest.raises(TooFewVehiclesError):
+        multibin_scores(shipped_head(), [missed])
+    with pytest.raises(TooFewVehiclesError):
+        reading_error(np.zeros(0))
+    # Two readings 10 % too far, two 30 %: the median is 20 %, and each is 0.1 of 1.2 from it.
+    found = reading_error(np.array([0.1, 0.1, 0.3, 0.3]))
+    assert found == {"bias_relative": 0.2, "sigma_relative": pytest.approx(0.1 / 1.2, abs=1e-4)}
+
+
+def shipped_head() -> Multibin:
+    return Multibin(load_pack("edge").networks["multibin"])

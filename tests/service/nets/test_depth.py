@@ -12,7 +12,7 @@ from onnx import TensorProto, helper, numpy_helper
 from service.depth_scale import cell_pixels
 from service.errors import PackError
 from service.nets.canvas import InputFit
-from service.nets.depth import DepthNet
+from service.nets.depth import DepthNet, InverseDepth
 from service.nets.pack import METADATA_KEY, open_network
 
 STRIDE = 8
@@ -67,3 +67,20 @@ def test_cells_lie_where_the_map_says(size: tuple[int, int] | None, batch: int |
 def test_images_in_the_middle_of_their_canvas_are_refused() -> None:
     with pytest.raises(PackError, match="corner"):
         depth_net(InputFit((96, 64), "center").to_metadata())
+
+
+@pytest.mark.parametrize(("stride", "shape"), [(8.0, (12, 20)), (15.0, (7, 11)), (24.0, (4, 6))])
+def test_a_map_on_other_cells_says_the_same_of_every_pixel(stride: float, shape: tuple[int, int]) -> None:
+    pixels = cell_pixels((12, 20), 8.0)
+    plane = InverseDepth((0.01 * pixels[..., 0] - 0.03 * pixels[..., 1]).astype(np.float32), 8.0)
+    moved = plane.on_cells(shape, stride)
+    assert (moved.values.shape, moved.stride) == (shape, stride)
+    x, y = np.moveaxis(cell_pixels(shape, stride), -1, 0)
+    inside = (x >= 3.5) & (x <= 155.5) & (y >= 3.5) & (y <= 91.5)
+    assert inside.sum() > 20
+    # Positions are rounded to a 32nd of a cell by the resampler.
+    np.testing.assert_allclose(moved.values[inside], (0.01 * x - 0.03 * y)[inside], atol=0.04 * 8 / 32)
+
+
+def test_a_map_of_an_image_twice_as_wide_has_cells_twice_as_wide() -> None:
+    assert InverseDepth(np.zeros((2, 3), np.float32), 8.0).at_width(642, 1284).stride == 16.0

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from service.errors import PackError
-from service.nets.guided import GuidedSpec, decode_guided, guide_maps, suppress_guided
+from service.nets.canvas import InputFit
+from service.nets.guided import GuidedDetector, GuidedSpec, decode_guided, guide_maps, suppress_guided
 
 SPEC = GuidedSpec(
     classes=("car", "bus"),
@@ -24,6 +26,9 @@ SPEC = GuidedSpec(
     guide_stride=8,
     sigma_scale=np.full(7, 2.0),
 )
+
+
+CENTERED = {"width": 48, "height": 32, "place": "center", "pad": 114}
 
 
 def outputs(spec: GuidedSpec, *, variances: bool = True) -> list[np.ndarray]:
@@ -104,13 +109,45 @@ def test_maps_are_cut_padded_and_in_the_specs_camera() -> None:
     np.testing.assert_array_equal(no_scale[0], no_scale[1])
 
 
+@dataclass(frozen=True)
+class Replayed:
+    """A network that gives the same outputs for every image."""
+
+    metadata: dict[str, Any]
+    answers: list[np.ndarray]
+
+    def run(self, images: np.ndarray, guides: np.ndarray) -> list[np.ndarray]:
+        assert images.shape == (len(guides), 32, 48, 3)
+        assert guides.shape[1:] == (2, 4, 6)
+        return [np.repeat(answer[None], len(images), 0) for answer in self.answers]
+
+
+def test_what_is_found_on_a_fixed_canvas_lies_in_the_image() -> None:
+    spec = replace(SPEC, fit=InputFit((48, 32)))
+    detector = GuidedDetector(Replayed(spec.to_metadata(), outputs(SPEC)))  # type: ignore[arg-type]
+    # The image is twice as large as the canvas, so the canvas' focal length is half of its camera's.
+    shape, stride = spec.guide_grid((96, 64))
+    assert (shape, stride) == ((4, 6), 16.0)
+    maps = guide_maps(spec, (96, 64), 400.0, None, np.full(shape, 0.02))
+    np.testing.assert_allclose(maps, 0.01, rtol=1e-6)
+    (found,) = detector.detect([np.zeros((64, 96, 3), np.uint8)], [maps], [400.0])
+    on_canvas = suppress_guided(decode_guided(outputs(SPEC), SPEC, 200.0, 0.3), 0.4)
+    np.testing.assert_allclose(found.xyxy_px, 2 * on_canvas.xyxy_px + 0.5)
+    np.testing.assert_allclose(found.center_px, 2 * on_canvas.center_px + 0.5)
+    np.testing.assert_allclose(found.depth_m, on_canvas.depth_m)
+    np.testing.assert_allclose(found.sigma[:, :2], 2 * on_canvas.sigma[:, :2])
+    np.testing.assert_allclose(found.sigma[:, 2:], on_canvas.sigma[:, 2:])
+
+
 def test_metadata_round_trip_and_what_is_missing() -> None:
+    fixed = replace(SPEC, fit=InputFit((48, 32)))
+    assert GuidedSpec.from_metadata(fixed.to_metadata()).fit == fixed.fit
     values = SPEC.to_metadata()
     again = GuidedSpec.from_metadata(values)
     assert again.to_metadata() == values
     del values["priors"]
     with pytest.raises(PackError, match="priors"):
         GuidedSpec.from_metadata(values)
-    for wrong in ({"std": [0.0] * 11}, {"guides": ["sonar"]}, {"priors": [[1.0] * 5]}):
+    for wrong in ({"std": [0.0] * 11}, {"guides": ["sonar"]}, {"priors": [[1.0] * 5]}, {"fit": CENTERED}):
         with pytest.raises(PackError, match="incomplete"):
             GuidedSpec.from_metadata({**SPEC.to_metadata(), **wrong})
