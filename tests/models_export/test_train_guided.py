@@ -13,9 +13,9 @@ import torch
 from models_export.data.augment import NO_AUGMENT
 from models_export.data.dataset import parse_truth
 from models_export.data.guided_frames import NO_GUIDE_NOISE, GuidedFrame, GuideNoise
-from models_export.guided import PAPER_RECIPE
 from models_export.guided_losses import GuidedLossConfig, corner_loss
 from models_export.nets.guided import EdgeGuided, GuidedConfig, ResNetGuided
+from models_export.paper import paper_recipe
 from models_export.train.guided import GuidedTask, guided_loss
 from models_export.train.guided_corners import corners
 from models_export.train.guided_targets import AssignConfig
@@ -183,7 +183,8 @@ def test_a_disturbed_map_is_another_map(frames: list[GuidedFrame]) -> None:
 def test_the_published_size_learns_in_both_branches(frames: list[GuidedFrame]) -> None:
     torch.manual_seed(0)
     torch.set_num_threads(1)
-    recipe = PAPER_RECIPE
+    recipe = paper_recipe().guided
+    assert recipe is not None
     task = GuidedTask(
         frames[:2], ResNetGuided(recipe.net), assign=AssignConfig(best_iou=0.1), loss=recipe.loss, augment=STILL,
         noise=recipe.noise,
