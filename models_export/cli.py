@@ -112,6 +112,7 @@ def export_command(
     stand_ins: Annotated[
         bool, typer.Option("--stand-ins", help="Export a detector that finds too little to measure errors on.")
     ] = False,
+    base: Annotated[str | None, typer.Option(help="Pack that gives the networks of which --runs has no checkpoint.")] = None,
     beside: Annotated[str | None, typer.Option(help="Export 'guided' alone, into a copy of this pack.")] = None,
 ) -> None:
     """Export trained networks to a pack: checked against torch, measured on validation scenes, with a manifest.
@@ -122,7 +123,7 @@ def export_command(
     try:
         recipe = _recipe(pack)
         keep = tuple(recipe.network(name).name for name in fp32 or ())
-        options = ExportOptions(precision.value if precision else None, keep, _batch(batch), stand_ins)
+        options = ExportOptions(precision.value if precision else None, keep, _batch(batch), stand_ins, base)
         if beside is None:
             manifest = export(recipe, runs, data, out, options, console)
         if beside is not None or (runs / f"{GUIDED}.pt").is_file():

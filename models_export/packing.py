@@ -35,12 +35,13 @@ from models_export.validate import (
     reading_error,
 )
 from models_export.verify import require_parity
+from service.errors import InputError
 from service.nets.canvas import PADDED, InputFit
 from service.nets.depth import DepthNet
 from service.nets.detections import Detections
 from service.nets.detector import Detector
 from service.nets.multibin import Multibin
-from service.nets.pack import Manifest, Network, open_network
+from service.nets.pack import Manifest, Network, Pack, load_pack, open_network
 
 _CALIBRATION_SCENES, _CALIBRATION_IMAGES, _CALIBRATION_BATCH = 24, 96, 4
 _PARITY_IMAGES, _CROPS = 4, 32
@@ -62,6 +63,8 @@ class ExportOptions:
     stand_ins: bool = False
     """Export although the detector finds too few vehicles to measure errors on; ``UNMEASURED`` values stand for them then, and
     the manifest says so."""
+    base: str | None = None
+    """Pack that gives the networks of which ``runs`` holds no checkpoint, as they are; None: every network needs one."""
 
     def precision_of(self, network: NetworkRecipe) -> Precision:
         """The precision of a network."""
@@ -86,7 +89,9 @@ def export(
     some = training[:: max(len(training) // _CALIBRATION_SCENES, 1)][:_CALIBRATION_SCENES]
     calibration = recipe.samples(some)
     calibration = calibration[:: max(len(calibration) // _CALIBRATION_IMAGES, 1)]
-    job = _Job(recipe, runs, options or ExportOptions(), recipe.samples(validation), calibration)
+    options = options or ExportOptions()
+    base = None if options.base is None else load_pack(options.base, provider="cpu")
+    job = _Job(recipe, runs, options, recipe.samples(validation), calibration, base)
     detections = job.detector()
     job.multibin(detections)
     job.depth(detections)
@@ -97,9 +102,14 @@ def export(
         "scenes": {"training": len(training), "validation": len(validation)},
         "networks": job.provenance,
     }
-    classes = recipe.network("detector").config.classes
     return write_pack(
-        out, job.exported, name=recipe.name, version=recipe.version, classes=classes, training=provenance, scores=job.scores
+        out,
+        job.exported,
+        name=recipe.name,
+        version=recipe.version,
+        classes=job.classes(),
+        training=provenance,
+        scores=job.scores,
     )
 
 
@@ -129,12 +139,16 @@ class _Job:
     """Validation frames."""
     calibration: list[Sample]
     """Training frames whose activations set the int8 ranges."""
+    base: Pack | None = None
+    """Gives the networks that were not trained anew."""
     exported: list[Exported] = field(default_factory=list)
     scores: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
 
     def detector(self) -> list[Detections]:
         """The detector, and what it finds on the validation frames."""
+        if (kept := self._kept("detector")) is not None:
+            return detect_all(Detector(kept), self.samples)
         draft = self._frame_draft("detector")
         found = detect_all(Detector(draft.open()), self.samples)
         matches = match_all(found, self.samples)
@@ -144,6 +158,8 @@ class _Job:
 
     def multibin(self, found: list[Detections]) -> None:
         """The multi-bin head, measured on detected boxes."""
+        if self._kept("multibin") is not None:
+            return
         config = self.recipe.network("multibin").config
         draft = self._draft("multibin", _crop_batches(self.samples, config)[:4], _crop_batches(self.calibration, config))
         head, matches = Multibin(draft.open()), match_all(found, self.samples)
@@ -154,10 +170,41 @@ class _Job:
 
     def depth(self, found: list[Detections]) -> None:
         """The depth net, measured in detected boxes."""
+        if self._kept("depth") is not None:
+            return
         draft = self._frame_draft("depth")
         scores, errors = depth_scores(DepthNet(draft.open()), self.samples, match_all(found, self.samples))
         measured = self._measured("depth", lambda: reading_error(errors))
         self._finish(draft, measured, scores | measured)
+
+    def classes(self) -> tuple[str, ...]:
+        """The detector's classes. Raises InputError when a kept detector's are others than the recipe's first ones."""
+        ours: tuple[str, ...] = self.recipe.network("detector").config.classes
+        if self._checkpoint("detector").is_file() or self.base is None:
+            return ours
+        kept = tuple(self.base.manifest.classes)
+        if kept != ours[: len(kept)]:
+            raise InputError(f"its classes are {', '.join(kept)}.", field="base", remedy=f"They must be {', '.join(ours)}.")
+        return kept
+
+    def _checkpoint(self, name: str) -> Path:
+        return self.runs / f"{name}.pt"
+
+    def _kept(self, name: str) -> Network | None:
+        """The base pack's network, taken over with its scores and provenance; None where there is a checkpoint, or no base."""
+        if self.base is None or self._checkpoint(name).is_file():
+            return None
+        manifest = self.base.manifest
+        entry = manifest.networks[name]
+        data = (self.base.path / entry.file).read_bytes()
+        self.exported.append(Exported(name, data, entry.precision, entry.parameters))
+        self.scores[name] = manifest.scores.get(name, {})
+        self.provenance[name] = {
+            "taken_from": f"{manifest.name} {manifest.version}",
+            "data": manifest.training.get("data"),
+            **manifest.training.get("networks", {}).get(name, {}),
+        }
+        return self.base.networks[name]
 
     def _measured(self, name: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """What is measured of a network on detected vehicles, or stand-ins where there are too few and the options allow it."""
@@ -177,10 +224,10 @@ class _Job:
     def _draft(self, name: str, inputs: list[Images], calibration: list[Images]) -> _Draft:
         """Checkpoint to ONNX at the asked precision and batch; each form that can be is compared with torch on ``inputs``."""
         network = self.recipe.network(name)
-        state = read_checkpoint(self.runs / f"{name}.pt")
+        state = read_checkpoint(self._checkpoint(name))
         self.provenance[name] = {"training": state["config"], "task": state["task"], "steps": state["step"]}
         config = resolved_config(network, state["task"]["net"])
-        net, _ = load_averaged(self.runs / f"{name}.pt", network.build(config))
+        net, _ = load_averaged(self._checkpoint(name), network.build(config))
         example_hw = network.canvas_hw or (_EXAMPLE_HEIGHT, self.recipe.network("detector").config.max_width)
         model = to_onnx(network.for_export(net), name, example_hw, network.outputs, dynamic_hw=network.canvas_hw is None)
         precision = self.options.precision_of(network)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -101,6 +102,17 @@ def test_a_pack_goes_from_checkpoints_to_the_service(
     assert scores["detector"]["AP_2d_50"] > 50
     result = Pipeline(pack).run(frame_set(open_scene(toy_scenes / "toy-09"), 0))
     assert sum(result.detections.values()) > 0
+    # One network trained anew, the others as they are.
+    anew = tmp_path / "anew"
+    anew.mkdir()
+    shutil.copy(runs / "multibin.pt", anew)
+    run_export(toy_scenes, anew, anew / "pack", "--base", str(tmp_path))
+    second = load_pack(str(anew / "pack")).manifest
+    for name in ("detector", "depth"):
+        assert second.networks[name] == pack.manifest.networks[name]
+        assert second.scores[name] == pack.manifest.scores[name]
+        assert second.training["networks"][name]["taken_from"] == "edge 2"
+    assert second.networks["multibin"] != pack.manifest.networks["multibin"]
 
 
 @pytest.mark.parametrize(
