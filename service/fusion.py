@@ -87,8 +87,8 @@ class FusionSettings:
     Near 1, for another vehicle may hide it."""
     view_range_m: float = 40.0
     """A camera is expected to report vehicles up to this distance, metres."""
-    solver: SolverSettings = field(default_factory=lambda: SolverSettings(step_tolerance=2.0))
-    """For vehicles of several cameras; they start near the solution."""
+    solver: SolverSettings = field(default_factory=lambda: SolverSettings(step_tolerance=4.0))
+    """For vehicles of several cameras. They start near the solution, where one step takes most of them all the way."""
 
 
 def fuse(
@@ -137,7 +137,7 @@ def _loosened(
 
     Boxes are displaced; height rests on the ground. Pictures are shifted, by the same angle and displacement.
     """
-    origin = np.stack([camera.position_m for camera in cameras])
+    origin = np.array([camera.position_m for camera in cameras])
     offset = boxes.center - origin[owner]
     near, angle = settings.calibration_sigma_m**2, settings.calibration_sigma_rad**2
     squared = offset * offset

@@ -19,7 +19,7 @@ def whole_in_view(boxes: Boxes, cameras: Sequence[Camera], range_m: float) -> ND
     """
     if len(boxes) == 0 or len(cameras) == 0:
         return np.zeros((len(boxes), len(cameras)), dtype=bool)
-    T = np.stack([camera.T_cam_world for camera in cameras])
+    T = np.array([camera.T_cam_world for camera in cameras])
     points = np.empty((len(boxes), 9, 3))
     points[:, :8], points[:, 8] = box_corners(boxes.center, boxes.dims_lwh, boxes.yaw), boxes.center
     points_cam = points.reshape(-1, 3) @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
@@ -37,7 +37,7 @@ def _pixels(cameras: Sequence[Camera], points_cam: Array) -> Array:
     """Pixels (C, P, 2) of points (C, P, 3), each in its own camera's frame."""
     if any(camera.has_distortion for camera in cameras):
         return np.stack([camera.project_cam(points) for camera, points in zip(cameras, points_cam, strict=True)])
-    K = np.stack([camera.K for camera in cameras])
+    K = np.array([camera.K for camera in cameras])
     normalised = points_cam[..., :2] / np.maximum(points_cam[..., 2:], MIN_DEPTH_M)
     pixels: Array = normalised @ K[:, :2, :2].transpose(0, 2, 1) + K[:, None, :2, 2]
     return pixels
