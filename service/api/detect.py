@@ -81,7 +81,8 @@ async def answer(service: Service, frame_set: FrameSet, *, per_camera: bool = Fa
         for camera in message.cameras.values():
             if camera.skew_ms is not None:
                 service.telemetry.skew(camera.skew_ms)
-        service.telemetry.frame_set(frame_set.site.id, statuses, len(message.boxes), message.timing_ms.model_dump())
+        timing_ms = message.timing_ms.model_dump(exclude_unset=True)
+        service.telemetry.frame_set(frame_set.site.id, statuses, len(message.boxes), timing_ms)
         if service.settings.viewer:
             service.recent.add(frame_set)
         if tracked is not None:
