@@ -78,7 +78,7 @@ def test_the_pack_is_trained_exported_and_served(toy_scenes: Path, tmp_path: Pat
     assert scores["detector"]["stand_ins"] is True
 
     # The guided detector's cells are 8 px of the frame, the depth net's 8 px of a canvas on which the frame is scaled by 0.6.
-    pipeline = Pipeline(pack, PipelineSettings(hard_mode="always", score_threshold=0.01))
+    pipeline = Pipeline(pack, PipelineSettings(hard_mode="always", score_threshold=1e-4))
     pipeline.warm_up()
     scene = open_scene(toy_scenes / "toy-09")
     moment = scene.truth(0).captured_at_ns
