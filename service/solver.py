@@ -35,7 +35,7 @@ class SolverSettings:
 
     iterations: int = 6
     """Most steps; boxes that have converged stand still before that."""
-    step_tolerance: float = 1.0
+    step_tolerance: float = 0.5
     """A box has converged with a step shorter than this, in its own sigmas (Mahalanobis). Near the solution each step leaves a
     small part of the distance before it: what remains after the last one is far below a sigma."""
 
