@@ -145,9 +145,9 @@ def test_eight_frames_are_learned_by_heart_and_served(toy_samples: list[Sample])
     canvases = np.stack([sample.canvas for sample in samples])
     batch = {"images": torch.from_numpy(canvases), "targets": torch.from_numpy(targets)}
     optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 150)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 200)
     history = []
-    for _ in range(150):
+    for _ in range(200):
         optimizer.zero_grad()
         losses = task.loss(net, batch)
         losses["total"].backward()

@@ -15,7 +15,7 @@ from service.nets.detector_spec import DetectorSpec
 from service.nets.error_model import ErrorModel
 from service.nets.multibin import UNCERTAIN
 
-CONFIG = DetectorConfig()
+CONFIG = DetectorConfig(classes=("car",))
 
 
 def spec_of(config: DetectorConfig) -> DetectorSpec:

@@ -66,6 +66,7 @@ def frames() -> list[Sample]:
                     alpha=np.zeros(count),
                     visible=visible[seen],
                     truncated=np.zeros(count),
+                    center=truth[step].center[seen],
                     ground=site.ground,
                     inverse_depth=np.zeros((1, 1), np.float32),
                 )

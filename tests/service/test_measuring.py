@@ -28,7 +28,7 @@ SURE = np.array([[0.02, 0.1, 0.05, 0.04, 1.5, 1.6, 1.7, 1.8]])
 
 def still(factor: int = 2) -> Still:
     image = np.random.default_rng(0).integers(0, 255, (360, 640, 3), dtype=np.uint8)
-    return Still(CAMERA, image, image[::factor, ::factor].copy())
+    return Still(CAMERA, image, image[::factor, ::factor].copy(), image)
 
 
 def found(box: list[float]) -> Detections:
