@@ -16,6 +16,10 @@ from service.nets.multibin import crop_vehicles
 from service.pipeline import Pipeline
 
 
+PREPARE_S = 10.0
+"""Seconds after which no further set is prepared."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Work:
     frame_set: FrameSet
@@ -28,7 +32,7 @@ class BareLoop:
 
     def __init__(self, pipeline: Pipeline, sets: Sequence[FrameSet]) -> None:
         self._pipeline = pipeline
-        self._work = [self._prepare(frame_set) for frame_set in sets]
+        self._work = self._prepared(sets)
 
     def run(self, seconds: float, threads: int) -> tuple[int, float]:
         """Sets done by ``threads`` threads in about ``seconds``, and the seconds it really took."""
@@ -57,6 +61,15 @@ class BareLoop:
                 network.run(batch.pixels)
         if len(work.crops):
             pipeline.multibin.network.run(work.crops)
+
+    def _prepared(self, sets: Sequence[FrameSet]) -> list[_Work]:
+        """As many of the sets as are prepared in ``PREPARE_S``: all of them, unless the networks are slow."""
+        began, work = time.perf_counter(), [self._prepare(sets[0])]
+        for frame_set in sets[1:]:
+            if time.perf_counter() - began > PREPARE_S:
+                break
+            work.append(self._prepare(frame_set))
+        return work
 
     def _prepare(self, frame_set: FrameSet) -> _Work:
         images, settings = self._images(frame_set), self._pipeline.settings
