@@ -10,11 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.frames import FrameSet, decode
+from service.frames import FrameSet
+from service.measuring import cut_detected
 from service.nets.canvas import Canvases
-from service.nets.multibin import crop_vehicles
 from service.pipeline import Pipeline
-
 
 PREPARE_S = 10.0
 """Seconds after which no further set is prepared."""
@@ -55,7 +54,7 @@ class BareLoop:
 
     def _run(self, work: _Work) -> None:
         pipeline = self._pipeline
-        canvases = Canvases(self._images(work.frame_set))
+        canvases = Canvases([still.small for still in pipeline.decode(work.frame_set)[0]])
         for network, fit in ((pipeline.detector.network, pipeline.detector.fit), (pipeline.depth.network, pipeline.depth.fit)):
             for batch in canvases.batches(fit):
                 network.run(batch.pixels)
@@ -72,12 +71,7 @@ class BareLoop:
         return work
 
     def _prepare(self, frame_set: FrameSet) -> _Work:
-        images, settings = self._images(frame_set), self._pipeline.settings
+        stills, settings = self._pipeline.decode(frame_set)[0], self._pipeline.settings
+        images = [still.small for still in stills]
         found = self._pipeline.detector.detect(images, score_threshold=settings.score_threshold, nms_iou=settings.nms_iou)
-        side = self._pipeline.multibin.spec.crop_px
-        crops = [crop_vehicles(image, boxes.xyxy_px, side) for image, boxes in zip(images, found, strict=True)]
-        return _Work(frame_set, np.concatenate(crops))
-
-    def _images(self, frame_set: FrameSet) -> list[NDArray[np.uint8]]:
-        width = self._pipeline.detector.spec.max_width
-        return [decode(frame.data, frame_set.site.camera(frame.camera_id), width) for frame in frame_set.frames]
+        return _Work(frame_set, cut_detected(stills, found, self._pipeline.multibin.spec.crop_px).pixels)

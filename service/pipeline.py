@@ -113,7 +113,7 @@ class Pipeline:
         timing: dict[str, float] = {}
         started = time.perf_counter()
         with _timed(timing, "decode"):
-            stills, failed = self._decode(frame_set)
+            stills, failed = self.decode(frame_set)
         cameras = [still.camera for still in stills]
         with _timed(timing, "detect"):
             canvases = Canvases([still.small for still in stills])
@@ -189,7 +189,11 @@ class Pipeline:
         sigma = np.sqrt(boxes.covariance[:, 0, 0] + boxes.covariance[:, 1, 1])
         return confident & (sigma <= self.settings.max_position_sigma_m)
 
-    def _decode(self, frame_set: FrameSet) -> tuple[list[Still], dict[str, FrameError]]:
+    def decode(self, frame_set: FrameSet) -> tuple[list[Still], dict[str, FrameError]]:
+        """The first step alone: every frame at the sizes that the networks want, and the cameras whose frames are damaged.
+
+        Raises the first FrameError when not one frame can be decoded.
+        """
         stills, failed = [], {}
         small_width = self.detector.spec.max_width
         crop_width = max(self.multibin.spec.max_width or 0, small_width)
