@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from models_export.data.samples import Sample
 from service.depth_scale import DepthScale, fit_scale, ground_inverse_depth, read_boxes
 from service.errors import InputError
-from service.geometry.boxes import cut_edges
+from service.geometry.boxes import cut_edges, scaled_extents
 from service.geometry.camera import Camera, ray_azimuth
 from service.geometry.iou import iou_2d
 from service.geometry.transforms import Array, wrap_angle
@@ -212,7 +212,7 @@ def _head_errors(multibin: Multibin, m: Matched) -> _HeadErrors:
     if spec.max_width is not None and sample.still is not None:
         image, camera = sample.still.at(spec.max_width)
     factor = np.array([image.shape[1] / sample.image_size[0], image.shape[0] / sample.image_size[1]])
-    detected, truth = (_enlarged(xyxy, factor) for xyxy in (m.xyxy_px, sample.xyxy_px[m.truth]))
+    detected, truth = (scaled_extents(xyxy, factor) for xyxy in (m.xyxy_px, sample.xyxy_px[m.truth]))
     estimate = multibin.estimate(cut_crops(image, detected, spec.crop_px), sample.cls[m.truth])
     turn = wrap_angle(estimate.alpha + _azimuth(camera, detected) - sample.alpha[m.truth] - _azimuth(camera, truth))
     flip = np.abs(turn) > np.pi / 2
@@ -224,12 +224,6 @@ def _head_errors(multibin: Multibin, m: Matched) -> _HeadErrors:
     error = np.concatenate([angle[:, None], estimate.dims_lwh - sample.dims_lwh[m.truth], edges], 1)
     sigma = np.ones_like(error) if estimate.sigma is None else estimate.sigma
     return _HeadErrors(error, sigma, flip, cut.any(1), m.score)
-
-
-def _enlarged(xyxy_px: Array, factor: Array) -> Array:
-    """Boxes (N, 4) in an image ``factor`` (2,) times as large; pixel centres at integers."""
-    larger: Array = (xyxy_px + 0.5) * np.tile(factor, 2) - 0.5
-    return larger
 
 
 def _azimuth(camera: Camera, xyxy_px: Array) -> Array:

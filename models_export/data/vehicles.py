@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from models_export.data.dataset import UNKNOWN_CONDITION
 from models_export.data.detection import VehicleSample
-from service.geometry.boxes import clip_extents
+from service.geometry.boxes import clip_extents, scaled_extents
 from service.geometry.camera import Camera, ray_azimuth
 from service.geometry.transforms import Array, wrap_angle
 from service.nets.multibin import CONTEXT, crop_vehicles, crop_windows
@@ -75,9 +75,7 @@ def vehicles_of(sample: VehicleSample, max_width: int | None = None) -> list[Veh
     image, camera = sample.canvas[:height, :width], sample.camera
     if max_width is not None and sample.still is not None:
         image, camera = sample.still.at(max_width)
-    factor = np.tile([image.shape[1] / width, image.shape[0] / height], 2)
-    # Pixel centres lie at integers.
-    boxes = clip_extents(camera, (sample.xyxy_px + 0.5) * factor - 0.5)
+    boxes = clip_extents(camera, scaled_extents(sample.xyxy_px, (image.shape[1] / width, image.shape[0] / height)))
     weather = sample.labels.get("weather", UNKNOWN_CONDITION)
     rows = np.flatnonzero(~sample.ignore & sample.class_known)
     return [_cut(image, camera, boxes[row], sample, row, weather) for row in rows]

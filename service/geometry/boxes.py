@@ -116,6 +116,12 @@ def cut_edges(camera: Camera, xyxy_px: ArrayLike, border_px: float = BORDER_PX) 
     return np.concatenate([xyxy[:, :2] <= border_px, xyxy[:, 2:] >= limits - border_px], 1)
 
 
+def scaled_extents(xyxy_px: ArrayLike, factor: ArrayLike) -> Array:
+    """2D boxes (N, 4) in an image ``factor`` (2,) times as wide and high; pixel centres lie at integers."""
+    scaled: Array = (np.asarray(xyxy_px, dtype=np.float64) + 0.5) * np.tile(np.asarray(factor, dtype=np.float64), 2) - 0.5
+    return scaled
+
+
 def clip_extents(camera: Camera, xyxy: ArrayLike) -> Array:
     """2D boxes (N, 4) clipped to the image, whose pixels span [0, width - 1] x [0, height - 1]."""
     limits = np.array([camera.width - 1, camera.height - 1] * 2, dtype=np.float64)

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +19,7 @@ from service.geometry.transforms import Array, wrap_angle
 from service.nets.canvas import PADDED, InputFit, Placement
 from service.nets.decoding import MAX_CANDIDATES
 from service.nets.depth import InverseDepth
+from service.nets.detections import unsuppressed
 from service.nets.pack import Network
 
 MAX_INVERSE_DEPTH = 0.5
@@ -294,12 +294,7 @@ def decoded_sigma(spec: GuidedSpec, anchor: NDArray[np.int64], decoded: DecodedB
 
 def suppress_guided(detections: GuidedDetections, nms_iou: float) -> GuidedDetections:
     """Greedy non-maximum suppression of the 2D boxes over all classes together."""
-    if len(detections) == 0:
-        return detections
-    xywh = detections.xyxy_px.copy()
-    xywh[:, 2:] -= xywh[:, :2]
-    keep = cv2.dnn.NMSBoxes(xywh.tolist(), detections.score.tolist(), 0.0, nms_iou)
-    return detections.take(np.asarray(keep, dtype=np.int64).reshape(-1))
+    return detections.take(unsuppressed(detections.xyxy_px, detections.score, nms_iou))
 
 
 def _heading(spec: GuidedSpec, prior_alpha: Array, heading: Array) -> tuple[Array, Array]:
