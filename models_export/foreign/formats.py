@@ -10,15 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models_export.foreign.graph import Normalisation
+from models_export.nets.yolov3 import Yolov3Config, tiny_config
 from service.errors import InputError
 from service.nets.decoding import BOX_FIELDS
 from service.nets.detector_spec import Format
 
-_DARKNET_ANCHORS: dict[int, list[list[list[int]]]] = {
-    3: [[[10, 13], [16, 30], [33, 23]], [[30, 61], [62, 45], [59, 119]], [[116, 90], [156, 198], [373, 326]]],
-    2: [[[23, 27], [37, 58], [81, 82]], [[81, 82], [135, 169], [344, 319]]],
+_DARKNET_ANCHORS = {
+    len(config.strides): [[list(pair) for pair in scale] for scale in config.anchors_px]
+    for config in (Yolov3Config(), tiny_config())
 }
-"""Published anchors of YOLOv3 and YOLOv3-tiny (masks 1,2,3 and 3,4,5), px, by the number of scales."""
+"""Published anchors of YOLOv3 and YOLOv3-tiny, px, by the number of scales."""
 _STRIDES = ((8, 16, 32), (8, 16, 32, 64))
 _NANODET_PLUS_SCALES = 4
 _LEAST_BINS = 2
