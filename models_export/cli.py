@@ -113,6 +113,9 @@ def export_command(
         bool, typer.Option("--stand-ins", help="Export a detector that finds too little to measure errors on.")
     ] = False,
     base: Annotated[str | None, typer.Option(help="Pack that gives the networks of which --runs has no checkpoint.")] = None,
+    validation: Annotated[
+        list[Path] | None, typer.Option(help="Data set that did not train, to measure on; the held-out scenes if left out.")
+    ] = None,
     beside: Annotated[str | None, typer.Option(help="Export 'guided' alone, into a copy of this pack.")] = None,
 ) -> None:
     """Export trained networks to a pack: checked against torch, measured on validation scenes, with a manifest.
@@ -125,7 +128,7 @@ def export_command(
         keep = tuple(recipe.network(name).name for name in fp32 or ())
         options = ExportOptions(precision.value if precision else None, keep, _batch(batch), stand_ins, base)
         if beside is None:
-            manifest = export(recipe, runs, data, out, options, console)
+            manifest = export(recipe, runs, data, out, options, console, validation or ())
         if beside is not None or (runs / f"{GUIDED}.pt").is_file():
             manifest = export_guided(runs, data, beside or str(out), out, recipe.guided, console)
     except QuadliftError as error:

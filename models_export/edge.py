@@ -55,7 +55,7 @@ def _multibin(config: MultibinConfig) -> NetworkRecipe:
         build=EdgeMultibin,
         task=MultibinTask,
         training=TrainConfig(steps=6500, batch_size=128, learning_rate=1e-3),
-        outputs=("vectors", "confidence", "residual", "edges", "log_sigma"),
+        outputs=("vectors", "confidence", "residual", "outline", "log_sigma"),
         metadata=uncertain_multibin_metadata,
         real=RealData.vehicles,
         canvas_hw=(config.crop_px, config.crop_px),

@@ -67,6 +67,21 @@ def likelihood_loss(error: Tensor, log_sigma: Tensor, beta: float = 0.5) -> Tens
     return weight * (0.5 * (error * torch.exp(-log_sigma)) ** 2 + log_sigma)
 
 
+def places_loss(logits: Tensor, target: Tensor, places: Tensor) -> Tensor:
+    """Cross entropy (N, R) of distributions over evenly spaced ``places`` (P,), logits (N, R, P), for targets (N, R).
+
+    The target is shared between the two places beside it, so that its mean is exact (distribution focal loss without its focus,
+    Li et al., Generalized Focal Loss, eq. 6). Targets beyond the places count as the outermost.
+    """
+    step = places[1] - places[0]
+    position = ((target - places[0]) / step).clamp(0, len(places) - 1)
+    low = position.floor().clamp(max=len(places) - 2).long()
+    share = position - low
+    log_odds = logits.log_softmax(-1)
+    near, far = (log_odds.gather(-1, index[..., None])[..., 0] for index in (low, low + 1))
+    return -((1 - share) * near + share * far)
+
+
 def align(values: Tensor, mask: Tensor) -> Tensor:
     """Values (B, H, W) less their median, over their mean absolute deviation, per image over valid pixels only.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from service.geometry.boxes import TANGENT_DEGREES
 from service.nets.multibin import UNCERTAIN
 
 UNMEASURED: dict[str, dict[str, Any]] = {
@@ -42,8 +43,13 @@ def multibin_metadata(config: Any) -> dict[str, Any]:
 
 
 def uncertain_multibin_metadata(config: Any) -> dict[str, Any]:
-    """Of a head that also reads edges and predicts its own standard deviations, in crops of larger images."""
-    return multibin_metadata(config) | {"max_width": config.max_width, "sigma_scale": [1.0] * len(UNCERTAIN)}
+    """Of a head that also reads edges and tangents and predicts its own standard deviations, in crops of larger images."""
+    readings = len(UNCERTAIN) + len(TANGENT_DEGREES)
+    return multibin_metadata(config) | {
+        "max_width": config.max_width,
+        "tangents_deg": list(TANGENT_DEGREES),
+        "sigma_scale": [1.0] * readings,
+    }
 
 
 def depth_metadata(config: Any) -> dict[str, Any]:

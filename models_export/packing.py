@@ -78,20 +78,25 @@ def export(
     out: Path,
     options: ExportOptions | None = None,
     console: Console | None = None,
+    validation: Sequence[Path] = (),
 ) -> Manifest:
-    """Export the trained networks of ``runs`` to a pack in ``out``, checked, and measured on the validation scenes of ``data``.
+    """Export the trained networks of ``runs`` to a pack in ``out``, checked, and measured on validation scenes.
 
+    data: data sets that trained; some of their scenes set the ranges of int8. validation: data sets that did not; without any,
+    those scenes of ``data`` that training holds out.
     Raises PackError when torch and ONNX Runtime disagree, InputError when a checkpoint is missing, TooFewVehiclesError when the
     detector finds too little to measure anything on.
     """
     console = console or Console()
-    training, validation = split_scenes(data)
+    training, held_out = split_scenes(data)
+    if validation:
+        training, held_out = training + held_out, [scene for root in validation for scene in list_scenes(root)]
     some = training[:: max(len(training) // _CALIBRATION_SCENES, 1)][:_CALIBRATION_SCENES]
     calibration = recipe.samples(some)
     calibration = calibration[:: max(len(calibration) // _CALIBRATION_IMAGES, 1)]
     options = options or ExportOptions()
     base = None if options.base is None else load_pack(options.base, provider="cpu")
-    job = _Job(recipe, runs, options, recipe.samples(validation), calibration, base)
+    job = _Job(recipe, runs, options, recipe.samples(held_out), calibration, base)
     detections = job.detector()
     job.multibin(detections)
     job.depth(detections)
@@ -99,7 +104,7 @@ def export(
         console.print(name, scores)
     provenance = {
         "data": [_data_description(root) for root in data],
-        "scenes": {"training": len(training), "validation": len(validation)},
+        "scenes": {"training": len(training), "validation": len(held_out)},
         "networks": job.provenance,
     }
     return write_pack(

@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from models_export.data.samples import Sample
 from service.depth_scale import DepthScale, fit_scale, ground_inverse_depth, read_boxes
 from service.errors import InputError
-from service.geometry.boxes import cut_edges, scaled_extents
+from service.geometry.boxes import cut_edges, scaled_extents, tangents_of
 from service.geometry.camera import Camera, ray_azimuth
 from service.geometry.iou import iou_2d
 from service.geometry.transforms import Array, wrap_angle
@@ -24,7 +24,7 @@ from service.nets.depth import UNBIASED, DepthNet, InverseDepth
 from service.nets.detections import Detections
 from service.nets.detector import Detector, box_size
 from service.nets.error_model import ErrorModel
-from service.nets.multibin import Multibin, cut_crops
+from service.nets.multibin import OUTLINE, Multibin, cut_crops
 
 SCORE_FLOOR = 0.05
 """Detections below do not enter the precision-recall curve."""
@@ -164,7 +164,7 @@ def edge_errors(matches: Sequence[Matched]) -> ErrorModel:
 def multibin_scores(multibin: Multibin, matches: Sequence[Matched]) -> dict[str, Any]:
     """Errors of angle and size on detected boxes: medians, flips, and the error models that lifting uses.
 
-    Of a head that predicts edges and standard deviations, also the edges' errors and ``sigma_scale``: what makes the predicted
+    Of a head that predicts an outline and standard deviations, also the outline' errors and ``sigma_scale``: what makes the predicted
     deviations cover 68 % of the errors. Raises TooFewVehiclesError.
     """
     rows = [_head_errors(multibin, m) for m in matches if len(m.truth)]
@@ -173,7 +173,7 @@ def multibin_scores(multibin: Multibin, matches: Sequence[Matched]) -> dict[str,
     error, sigma = np.concatenate([row.error for row in rows]), np.concatenate([row.sigma for row in rows])
     flipped, is_cut = np.concatenate([row.flipped for row in rows]), np.concatenate([row.is_cut for row in rows])
     score = np.concatenate([row.score for row in rows])
-    angles, sizes, edges = np.abs(error[:, 0]), error[:, 1:4], np.abs(error[:, 4:])
+    angles, sizes, outline = np.abs(error[:, 0]), error[:, 1:4], np.abs(error[:, OUTLINE])
     scores = {
         "vehicles": len(angles),
         "angle_median_deg": round(float(np.degrees(np.median(angles))), 3),
@@ -187,8 +187,8 @@ def multibin_scores(multibin: Multibin, matches: Sequence[Matched]) -> dict[str,
         return scores
     ratio = np.where(np.isfinite(error), np.abs(error) / sigma, np.nan)
     return scores | {
-        "edge_median_px": round(float(np.nanmedian(edges)), 3),
-        "edge_p90_px": round(float(np.nanpercentile(edges, 90)), 3),
+        "outline_median_px": round(float(np.nanmedian(outline)), 3),
+        "outline_p90_px": round(float(np.nanpercentile(outline, 90)), 3),
         "sigma_scale": np.nanpercentile(ratio, _NORMAL_68, axis=0).round(4).tolist(),
     }
 
@@ -198,9 +198,10 @@ class _HeadErrors:
     """What the head says of M matched detections, less the truth."""
 
     error: Array
-    """(M, 8) in the order of ``UNCERTAIN``: radians (flips aside), metres, px; NaN for edges that are cut, or not read."""
+    """(M, 8 or 16) in the order of ``UNCERTAIN`` and the tangents: radians (flips aside), metres, px; NaN for edges that are cut,
+    or not read."""
     sigma: Array
-    """(M, 8) predicted standard deviations; ones where the head predicts none."""
+    """(M, 8 or 16) predicted standard deviations; ones where the head predicts none."""
     flipped: NDArray[np.bool_]
     is_cut: NDArray[np.bool_]
     score: Array
@@ -214,14 +215,17 @@ def _head_errors(multibin: Multibin, m: Matched) -> _HeadErrors:
     factor = np.array([image.shape[1] / sample.image_size[0], image.shape[0] / sample.image_size[1]])
     detected, truth = (scaled_extents(xyxy, factor) for xyxy in (m.xyxy_px, sample.xyxy_px[m.truth]))
     estimate = multibin.estimate(cut_crops(image, detected, spec.crop_px), sample.cls[m.truth])
+    corners = (sample.corners_px[m.truth] + 0.5) * factor - 0.5
     turn = wrap_angle(estimate.alpha + _azimuth(camera, detected) - sample.alpha[m.truth] - _azimuth(camera, truth))
     flip = np.abs(turn) > np.pi / 2
     cut = cut_edges(camera, detected)
-    edges = np.full((len(m.truth), 4), np.nan)
+    outline = np.full((len(m.truth), 4), np.nan)
     if estimate.xyxy_px is not None:
-        edges = np.where(cut, np.nan, estimate.xyxy_px - truth)
+        outline = np.where(cut, np.nan, estimate.xyxy_px - truth)
+    if estimate.tangents_px is not None:
+        outline = np.concatenate([outline, estimate.tangents_px - tangents_of(corners)], 1)
     angle = wrap_angle(turn + np.pi * flip)
-    error = np.concatenate([angle[:, None], estimate.dims_lwh - sample.dims_lwh[m.truth], edges], 1)
+    error = np.concatenate([angle[:, None], estimate.dims_lwh - sample.dims_lwh[m.truth], outline], 1)
     sigma = np.ones_like(error) if estimate.sigma is None else estimate.sigma
     return _HeadErrors(error, sigma, flip, cut.any(1), m.score)
 

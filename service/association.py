@@ -14,16 +14,6 @@ from service.geometry.transforms import Array
 Index = NDArray[np.int64]
 
 
-def inverse_2x2(matrices: Array) -> Array:
-    """Inverses of symmetric, positive definite matrices (N, 2, 2); in closed form, several times quicker than LAPACK's."""
-    xx, xy, yy = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
-    inverse = np.empty_like(matrices)
-    scale = 1.0 / (xx * yy - xy * xy)
-    inverse[:, 0, 0], inverse[:, 1, 1] = yy * scale, xx * scale
-    inverse[:, 0, 1] = inverse[:, 1, 0] = -xy * scale
-    return inverse
-
-
 def mahalanobis_cost(a_xy: Array, a_cov: Array, b_xy: Array, b_cov: Array) -> tuple[Array, Array, Array]:
     """Squared Mahalanobis distance, d^2 + ln det S, and distance in metres: each (N, M), for points (N, 2) and (M, 2).
 

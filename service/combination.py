@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.association import Index, inverse_2x2
+from service.association import Index
 from service.geometry.boxes import STATE_DIM, YAW, Boxes, box_states
-from service.geometry.transforms import Array, wrap_angle
+from service.geometry.transforms import Array, inverse_2x2, wrap_angle
 from service.joint import solve_jointly
 from service.residuals import BoxProblem
 from service.solver import SolverSettings

@@ -18,11 +18,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.association import Index, best_of_duplicates, gated_assignment, inverse_2x2, mahalanobis_cost
+from service.association import Index, best_of_duplicates, gated_assignment, mahalanobis_cost
 from service.combination import combine, summable
 from service.geometry.boxes import Boxes
 from service.geometry.camera import Camera
-from service.geometry.transforms import Array
+from service.geometry.transforms import Array, inverse_2x2
 from service.joint import shared_covariance
 from service.residuals import BoxProblem
 from service.solver import SolverSettings
@@ -87,6 +87,9 @@ class FusionSettings:
     Near 1, for another vehicle may hide it."""
     view_range_m: float = 40.0
     """A camera is expected to report vehicles up to this distance, metres."""
+    doubt: float = 0.0
+    """How fast a score falls with what the covariance leaves open of the footprint: exp(-doubt (sigma along the length over the
+    length + sigma across over the width)). Boxes that are surely there but not surely *so* then come after those that are."""
     solver: SolverSettings = field(default_factory=lambda: SolverSettings(step_tolerance=4.0))
     """For vehicles of several cameras. They start near the solution, where one step takes most of them all the way."""
 
@@ -103,7 +106,7 @@ def fuse(
     terms: what the N boxes were solved from (:func:`service.lifting.lift_with_terms`). With them a vehicle of several cameras
     is solved anew from everything that these saw; without, their boxes are combined by covariance, which is less exact.
     Score: 1 - prod(1 - s) over the cameras that contributed (false alarms of different cameras rarely coincide); then each
-    camera that should see the vehicle and is silent multiplies the odds by ``silence_ratio``.
+    camera that should see the vehicle and is silent multiplies the odds by ``silence_ratio``; then ``doubt`` lowers it.
     """
     settings = settings or FusionSettings()
     if len(boxes) == 0:
@@ -121,6 +124,8 @@ def fuse(
     members = np.zeros((len(fused), len(cameras)), dtype=bool)
     members[parts.row, parts.camera] = True
     score = _discounted(fused.score, _silences(fused, members, cameras, settings), settings.silence_ratio)
+    if settings.doubt:
+        score *= np.exp(-settings.doubt * footprint_doubt(fused))
     order = np.argsort(-score, kind="stable")
     rank = np.argsort(order)
     position = np.zeros(len(boxes), np.int64)
@@ -219,6 +224,16 @@ def _silences(fused: Boxes, members: NDArray[np.bool_], cameras: Sequence[Camera
     silent = whole_in_view(fused, cameras, settings.view_range_m) & ~members
     count: Array = silent.sum(1).astype(np.float64)
     return count
+
+
+def footprint_doubt(boxes: Boxes) -> Array:
+    """(M,) standard deviation of the centre along the length over the length, plus that across it over the width."""
+    heading = np.stack([np.cos(boxes.yaw), np.sin(boxes.yaw)], 1)
+    across = np.stack([-heading[:, 1], heading[:, 0]], 1)
+    place = boxes.covariance[:, :2, :2]
+    variances = [((place @ axis[..., None])[..., 0] * axis).sum(1) for axis in (heading, across)]
+    doubt: Array = sum(np.sqrt(variance) / boxes.dims_lwh[:, side] for side, variance in enumerate(variances))
+    return doubt
 
 
 def _discounted(score: Array, silences: Array, ratio: float) -> Array:

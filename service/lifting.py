@@ -13,11 +13,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.geometry.boxes import BORDER_PX, Boxes, box_corners
+from service.geometry.boxes import BORDER_PX, TANGENT_DIRECTIONS, Boxes, box_corners, tangents_of
 from service.geometry.camera import MIN_DEPTH_M, Camera
 from service.geometry.ground import Ground
 from service.geometry.transforms import Array, transform_points, wrap_angle
-from service.residuals import DEPTH, EDGES, GROUND, ROWS, BoxProblem
+from service.residuals import DEPTH, FIXED_ROWS, GROUND, BoxProblem
 from service.solver import MAX_DIM_M, MIN_DIM_M, SolverSettings, covariance_of, solve
 
 _MIN_SIGMA_PX, _MIN_SIGMA_M, _MIN_SIGMA_RAD = 0.25, 0.01, 0.005
@@ -26,6 +26,7 @@ _MIN_DEPTH_SIGMA_M, _MAX_DEPTH_M = 0.05, 1000.0
 _MIN_START_DEPTH_M = 1.0
 _LENS_PASSES = 2
 _MAX_LENS_MISS = 0.1
+_NOT_READ = np.zeros((0, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +57,15 @@ class Measurements:
     """(N,) depth of the visible surface along the optical axis, metres; NaN or not positive: no reading."""
     sigma_depth_m: Array
     """(N,) its standard deviation, metres."""
+    tangents_px: Array = field(default_factory=lambda: _NOT_READ)
+    """(N, 8) reach of the vehicles in ``TANGENT_DIRECTIONS``, px; (N, 0), the default, where nothing reads them."""
+    sigma_tangents_px: Array = field(default_factory=lambda: _NOT_READ)
+    """Their standard deviations, px."""
+
+    def __post_init__(self) -> None:
+        for name in ("tangents_px", "sigma_tangents_px"):
+            if getattr(self, name).shape == _NOT_READ.shape:
+                object.__setattr__(self, name, np.zeros((len(self), 0)))
 
     def __len__(self) -> int:
         return len(self.yaw)
@@ -100,9 +110,11 @@ def lift_with_terms(
     settings = settings or LiftSettings()
     seen = edge_measurements(cameras, measurements, slice(None), settings)
     problem = _problem(ground, seen, measurements, settings)
-    state, hessian = solve(problem, problem.prior, settings.solver)
-    for _ in range(_LENS_PASSES if any(camera.has_distortion for camera in cameras) else 0):
-        problem = replace(problem, edges=_straightened(cameras, measurements.camera_index, seen.xyxy_px, state, problem))
+    bent = np.array([camera.has_distortion for camera in cameras])
+    first = _without_tangents(problem, bent[measurements.camera_index]) if bent.any() else problem
+    state, hessian = solve(first, problem.prior, settings.solver)
+    for _ in range(_LENS_PASSES if bent.any() else 0):
+        problem = _straightened(cameras, measurements, seen, state, problem)
         state, hessian = solve(problem, state, settings.solver)
     boxes = Boxes(
         center=state[:, :3],
@@ -134,6 +146,12 @@ class EdgeMeasurements:
     """(N, 4) left, top, right, bottom, in undistorted normalised coordinates."""
     edge_weight: Array
     """(N, 4) 1 / sigma of the edges."""
+    tangents: Array
+    """(N, K) reach along ``directions``, normalised coordinates, as if no lens bent them."""
+    tangent_weight: Array
+    """(N, K) 1 / sigma of the tangents."""
+    directions: Array
+    """(N, K, 2) unit vectors, normalised coordinates."""
     bottom_ray: Array
     """(N, 3) viewing ray through the middle of the bottom edge, world, of depth 1."""
     center_ray: Array
@@ -160,6 +178,7 @@ def edge_measurements(cameras: Sequence[Camera], m: Measurements, rows: slice, s
     K = np.array([camera.K for camera in cameras])[index]
     points = _normalised(cameras, index, K, _middles(visible))
     rays = np.concatenate([points[:, 3:], np.ones_like(points[:, 3:, :1])], -1) @ T[:, :3, :3]
+    directions, tangents, tangent_weight = _tangents(K, m.tangents_px[rows], m.sigma_tangents_px[rows])
     return EdgeMeasurements(
         R=T[:, :3, :3],
         t=T[:, :3, 3],
@@ -168,6 +187,9 @@ def edge_measurements(cameras: Sequence[Camera], m: Measurements, rows: slice, s
         hinged=np.concatenate([low <= settings.border_px, high >= border - settings.border_px], 1),
         edges=points.reshape(-1, 10)[:, [0, 3, 4, 7]],
         edge_weight=K[:, [0, 1, 0, 1], [0, 1, 0, 1]] / _between(m.sigma_px[rows], _MIN_SIGMA_PX, _MAX_SIGMA_PX),
+        tangents=tangents,
+        tangent_weight=tangent_weight,
+        directions=directions,
         bottom_ray=rays[:, 0],
         center_ray=rays[:, 1],
         dims_lwh=_between(m.dims_lwh[rows], MIN_DIM_M, MAX_DIM_M),
@@ -183,9 +205,7 @@ def _problem(ground: Ground, seen: EdgeMeasurements, m: Measurements, settings: 
     sigma_ground = settings.ground_sigma_m + settings.ground_sigma_per_m * start_depth
     depth, depth_weight = _depth_readings(m)
     position_sigma = np.full((len(m), 3), settings.start_sigma_m)
-    huber = np.empty((len(m), ROWS))
-    huber[:, EDGES] = settings.huber_sigmas
-    huber[:, DEPTH] = settings.huber_sigmas
+    huber = np.full((len(m), FIXED_ROWS + seen.tangents.shape[1]), settings.huber_sigmas)
     huber[:, GROUND] = settings.ground_huber_sigmas
     return BoxProblem(
         R=seen.R,
@@ -194,6 +214,9 @@ def _problem(ground: Ground, seen: EdgeMeasurements, m: Measurements, settings: 
         edges=seen.edges,
         edge_weight=seen.edge_weight,
         hinged=seen.hinged,
+        tangents=seen.tangents,
+        tangent_weight=seen.tangent_weight,
+        directions=seen.directions,
         prior=np.concatenate([start, seen.dims_lwh, seen.yaw[:, None]], 1),
         prior_weight=1.0 / np.concatenate([position_sigma, seen.sigma_dims, seen.sigma_yaw[:, None]], 1),
         ground=ground,
@@ -203,6 +226,17 @@ def _problem(ground: Ground, seen: EdgeMeasurements, m: Measurements, settings: 
         depth_weight=depth_weight,
         huber=huber,
     )
+
+
+def _tangents(K: Array, reach_px: Array, sigma_px: Array) -> tuple[Array, Array, Array]:
+    """Directions (N, K, 2), reaches (N, K) and weights (N, K) in normalised coordinates; of matrices K (N, 3, 3)."""
+    if not reach_px.shape[1]:
+        return np.zeros((len(K), 0, 2)), reach_px, sigma_px
+    # Pixels are K times normalised points: a direction d in pixels is K' d there, and as long as pixels are many.
+    scaled = TANGENT_DIRECTIONS @ K[:, :2, :2]
+    length = np.sqrt((scaled * scaled).sum(2))
+    reach = (reach_px - K[:, :2, 2] @ TANGENT_DIRECTIONS.T) / length
+    return scaled / length[..., None], reach, length / _between(sigma_px, _MIN_SIGMA_PX, _MAX_SIGMA_PX)
 
 
 def _depth_readings(m: Measurements) -> tuple[Array, Array]:
@@ -238,25 +272,38 @@ def _normalised(cameras: Sequence[Camera], index: NDArray[np.int64], K: Array, p
     return points
 
 
-def _straightened(cameras: Sequence[Camera], index: NDArray[np.int64], xyxy: Array, state: Array, problem: BoxProblem) -> Array:
-    """Edges (N, 4) for a pinhole that miss the boxes at ``state`` by as much as the 2D boxes do through the real lens.
+def _without_tangents(problem: BoxProblem, bent: NDArray[np.bool_]) -> BoxProblem:
+    """The problem without the tangents of the boxes at a mask (N,): where a lens bends them it is not known yet."""
+    return replace(problem, tangent_weight=np.where(bent[:, None], 0.0, problem.tangent_weight))
+
+
+def _straightened(
+    cameras: Sequence[Camera], m: Measurements, seen: EdgeMeasurements, state: Array, problem: BoxProblem
+) -> BoxProblem:
+    """With edges and tangents for a pinhole that miss the boxes at ``state`` by as much as the readings do through the real lens.
 
     A lens bends straight edges, so an edge's middle undistorted is not where the box touches it; misses are.
     """
-    edges = problem.edges.copy()
-    for number in np.unique(index):
-        mine = np.flatnonzero(index == number)
+    edges, tangents, weight = problem.edges.copy(), seen.tangents.copy(), seen.tangent_weight.copy()
+    for number in np.unique(m.camera_index):
+        mine = np.flatnonzero(m.camera_index == number)
         camera = cameras[number]
         corners = transform_points(camera.T_cam_world, box_corners(state[mine, :3], state[mine, 3:6], state[mine, 6]))
         image = corners[..., :2] / np.maximum(corners[..., 2:], MIN_DEPTH_M)
         pixels = camera.pixels_from_normalised(image)
-        miss = xyxy[mine] - np.concatenate([pixels.min(1), pixels.max(1)], 1)
+        miss = seen.xyxy_px[mine] - np.concatenate([pixels.min(1), pixels.max(1)], 1)
         focal = camera.K[[0, 1, 0, 1], [0, 1, 0, 1]]
         straight = np.concatenate([image.min(1), image.max(1)], 1) + miss / focal
         # Far from its edge, or past the border, a box may lie where the lens model means nothing.
         trusted = ~problem.hinged[mine] & (np.abs(miss) < _MAX_LENS_MISS * focal)
         edges[mine] = np.where(trusted, straight, edges[mine])
-    return edges
+        if camera.has_distortion and tangents.shape[1]:
+            reach = (image @ seen.directions[mine].transpose(0, 2, 1)).max(1)
+            beyond = m.tangents_px[mine] - tangents_of(pixels)
+            near = np.abs(beyond) < _MAX_LENS_MISS * camera.K[0, 0]
+            tangents[mine] = reach + beyond / np.sqrt(((TANGENT_DIRECTIONS @ camera.K[:2, :2]) ** 2).sum(1))
+            weight[mine] = np.where(near, weight[mine], 0.0)
+    return replace(problem, edges=edges, tangents=tangents, tangent_weight=weight)
 
 
 def _start(ground: Ground, seen: EdgeMeasurements, settings: LiftSettings) -> tuple[Array, Array]:

@@ -17,8 +17,10 @@ from service.lifting import Measurements
 from service.nets.detections import Detections
 from service.nets.detector import edge_sigma
 from service.nets.detector_spec import DetectorSpec
-from service.nets.multibin import Crops, MultibinEstimates, MultibinSpec, cut_crops
+from service.nets.multibin import UNCERTAIN, Crops, Multibin, MultibinEstimates, MultibinSpec, cut_crops
 
+_MOST_SHIFT = 0.5
+"""Beyond this share of its side an outline is of another vehicle, or of none."""
 _UNKNOWN_YAW_SIGMA = np.pi / np.sqrt(3.0)
 """Standard deviation of an angle that may be any, radians."""
 
@@ -64,6 +66,31 @@ def cut_detected(stills: Sequence[Still], found: Sequence[Detections], crop_px: 
     return Crops.concatenate([cut_crops(still.image, own.scaled(still.scale).xyxy_px, crop_px) for still, own in pairs])
 
 
+def refined(
+    stills: Sequence[Still], found: Sequence[Detections], estimates: MultibinEstimates, head: Multibin, least_shift: float
+) -> MultibinEstimates:
+    """Estimates of which those are read again whose outlines and detected boxes disagree.
+
+    A head reads best what its crop shows in the middle. Where an edge that it read lies farther from the detector's than
+    ``least_shift`` of the box's longer side, a second crop is cut around the outline.
+    """
+    if estimates.xyxy_px is None or not len(estimates.alpha):
+        return estimates
+    index = np.repeat(np.arange(len(stills)), [len(own) for own in found])
+    boxes = np.concatenate([own.scaled(still.scale).xyxy_px for still, own in zip(stills, found, strict=True)])
+    side = (boxes[:, 2:] - boxes[:, :2]).max(1)
+    shift = np.abs(estimates.xyxy_px - boxes).max(1) / np.maximum(side, 1.0)
+    again = np.flatnonzero((shift > least_shift) & (shift < _MOST_SHIFT))
+    if not len(again):
+        return estimates
+    crops = [
+        cut_crops(still.image, estimates.xyxy_px[again[index[again] == row]], head.spec.crop_px)
+        for row, still in enumerate(stills)
+    ]
+    cls = np.concatenate([own.cls for own in found])
+    return estimates.with_rows(again, head.estimate(Crops.concatenate(crops), cls[again]))
+
+
 def measure(
     stills: Sequence[Still],
     found: Sequence[Detections],
@@ -80,12 +107,12 @@ def measure(
     score = np.concatenate([own.score for own in found])
     scale = np.tile(np.array([still.scale for still in stills]).reshape(-1, 2), 2)[index]
     xyxy, sigma_px = _edges(seen, cut, score, scale, estimates, detector)
+    tangents_px, sigma_tangents_px = _tangents(estimates)
     headed = np.isfinite(estimates.alpha)
     alpha, yaw = np.where(headed, estimates.alpha, 0.0), np.zeros(len(index))
-    centers = (seen[:, :2] + seen[:, 2:]) / 2
     for row, still in enumerate(stills):
         own_rows = index == row
-        yaw[own_rows] = yaw_from_alpha(still.camera, alpha[own_rows], centers[own_rows])
+        yaw[own_rows] = yaw_from_alpha(still.camera, alpha[own_rows], estimates.center_px[own_rows])
     sigma_yaw, sigma_dims = multibin.sigmas(estimates, score, cut.any(1))
     return Measurements(
         camera_index=index,
@@ -100,7 +127,16 @@ def measure(
         cls=np.concatenate([own.cls for own in found]),
         depth_m=readings.depth_m,
         sigma_depth_m=readings.sigma_m,
+        tangents_px=tangents_px,
+        sigma_tangents_px=sigma_tangents_px,
     )
+
+
+def _tangents(estimates: MultibinEstimates) -> tuple[Array, Array]:
+    """Tangents (N, K) and their standard deviations (N, K), px; K is 0 where the head reads none."""
+    if estimates.tangents_px is None or estimates.sigma is None:
+        return np.zeros((len(estimates.alpha), 0)), np.zeros((len(estimates.alpha), 0))
+    return estimates.tangents_px, estimates.sigma[:, len(UNCERTAIN) :]
 
 
 def _edges(
@@ -114,4 +150,4 @@ def _edges(
     if estimates.xyxy_px is None or estimates.sigma is None:
         small = (seen + 0.5) / scale - 0.5
         return seen, edge_sigma(detector, small, score, cut.any(1)) * scale
-    return np.where(cut, seen, estimates.xyxy_px), estimates.sigma[:, 4:]
+    return np.where(cut, seen, estimates.xyxy_px), estimates.sigma[:, 4 : len(UNCERTAIN)]

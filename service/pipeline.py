@@ -20,7 +20,7 @@ from service.geometry.boxes import Boxes
 from service.geometry.camera import Camera
 from service.guidance import Guidance, GuidanceSettings, HardMode, View
 from service.lifting import LiftSettings, Measurements, lift_with_terms
-from service.measuring import Still, cut_detected, measure
+from service.measuring import Still, cut_detected, measure, refined
 from service.nets.canvas import Canvases, canvas_size
 from service.nets.depth import DepthNet, InverseDepth
 from service.nets.detections import Detections
@@ -30,6 +30,10 @@ from service.nets.pack import Pack
 from service.paper_fusion import PaperFusionSettings, fuse_paper
 from service.residuals import BoxProblem
 from service.site import Site
+
+
+DOUBT = 2.0
+"""``FusionSettings.doubt`` of a pipeline, chosen on validation scenes (docs: fusion)."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,8 @@ class PipelineSettings:
     """2D detections of a lower score are dropped."""
     nms_iou: float = NMS_IOU
     """2D boxes that overlap a better one by more are dropped."""
+    refine_shift: float = 0.05
+    """Vehicles are read a second time whose outline differs from the detected box by more of its longer side; 1: none are."""
     min_fused_score: float = 0.3
     """Fused boxes of a lower score are dropped."""
     max_position_sigma_m: float = 1.2
@@ -51,8 +57,9 @@ class PipelineSettings:
     camera alone sees, from far away, often beside their own box from the other cameras. ``per_camera`` has them. The paper's
     method knows no such limit."""
     lift: LiftSettings = field(default_factory=LiftSettings)
+    """How exact the ground is, and for fusion the cameras, a site's own ``accuracy`` says."""
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
-    fusion: FusionSettings = field(default_factory=FusionSettings)
+    fusion: FusionSettings = field(default_factory=lambda: FusionSettings(doubt=DOUBT))
     paper_fusion: PaperFusionSettings = field(default_factory=PaperFusionSettings)
 
 
@@ -134,7 +141,7 @@ class Pipeline:
             # Guided boxes were not solved from terms: a set that has any is combined by covariance.
             terms = None if hard else terms
         with _timed(timing, "fuse"):
-            fused = self._fuse(lifted, terms, index, cameras)
+            fused = self._fuse(lifted, terms, index, cameras, frame_set.site)
             keep = self._reported(fused.boxes)
         timing["total"] = 1e3 * (time.perf_counter() - started)
         return SetResult(
@@ -151,12 +158,14 @@ class Pipeline:
         )
 
     def _lift(self, cameras: list[Camera], site: Site, measurements: Measurements) -> tuple[Boxes, BoxProblem | None]:
+        told = site.accuracy
+        settings = replace(self.settings.lift, ground_sigma_m=told.ground_m, ground_sigma_per_m=told.ground_per_m)
         if self.settings.method == "paper":
             # Imported here: the default method does not pay for it.
             from service.paper_lifting import lift_paper
 
-            return lift_paper(cameras, site.ground, measurements, self.settings.lift), None
-        return lift_with_terms(cameras, site.ground, measurements, self.settings.lift)
+            return lift_paper(cameras, site.ground, measurements, settings), None
+        return lift_with_terms(cameras, site.ground, measurements, settings)
 
     def _guided(
         self,
@@ -176,11 +185,20 @@ class Pipeline:
         return lifted, index, frozenset(still.camera.id for still, is_hard in zip(stills, hard, strict=True) if is_hard)
 
     def _fuse(
-        self, lifted: Boxes, terms: BoxProblem | None, camera_index: NDArray[np.int64], cameras: list[Camera]
+        self,
+        lifted: Boxes,
+        terms: BoxProblem | None,
+        camera_index: NDArray[np.int64],
+        cameras: list[Camera],
+        site: Site,
     ) -> FusedBoxes:
         if self.settings.method == "paper":
             return fuse_paper(lifted, camera_index, cameras, self.settings.paper_fusion)
-        return fuse(lifted, camera_index, cameras, self.settings.fusion, terms)
+        told = site.accuracy
+        settings = replace(
+            self.settings.fusion, calibration_sigma_m=told.camera_m, calibration_sigma_rad=told.camera_rad
+        )
+        return fuse(lifted, camera_index, cameras, settings, terms)
 
     def _reported(self, boxes: Boxes) -> NDArray[np.bool_]:
         confident = boxes.score >= self.settings.min_fused_score
@@ -216,7 +234,8 @@ class Pipeline:
 
     def _orient(self, stills: list[Still], found: list[Detections]) -> MultibinEstimates:
         crops = cut_detected(stills, found, self.multibin.spec.crop_px)
-        return self.multibin.estimate(crops, np.concatenate([detections.cls for detections in found]))
+        estimates = self.multibin.estimate(crops, np.concatenate([detections.cls for detections in found]))
+        return refined(stills, found, estimates, self.multibin, self.settings.refine_shift)
 
     def _metric_maps(
         self, frame_set: FrameSet, stills: list[Still], canvases: Canvases

@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from service.geometry.boxes import CORNER_SIGNS, STATE_DIM
 from service.geometry.camera import MIN_DEPTH_M
 from service.geometry.ground import Ground
-from service.geometry.transforms import Array
+from service.geometry.transforms import Array, inverse_2x2
 
-EDGES, GROUND, DEPTH = slice(0, 4), 4, 5
-"""Rows of the residual: left, top, right, bottom; bottom face on the ground; visible surface at the read depth."""
+GROUND, DEPTH, EDGES, OUTLINE = 0, 1, slice(2, 6), slice(2, None)
+"""Rows of the residual: bottom face on the ground; visible surface at the read depth; left, top, right, bottom; and these with
+the tangents after them."""
 
-ROWS = 6
+FIXED_ROWS = 6
+"""Rows before the tangents."""
 _EDGE_START = np.array([0, 8, 0, 8])
 _FAR_PARALLEL = 1e-9
 _TINY = 1e-30
@@ -29,7 +31,7 @@ _HALF_SIGNS = 0.5 * CORNER_SIGNS
 _OUTWARD = np.array([-1.0, -1.0, 1.0, 1.0])
 _DIAGONAL = np.arange(STATE_DIM)
 _PER_BOX = (
-    *("R", "t", "origin", "edges", "edge_weight", "hinged", "prior", "prior_weight"),
+    *("R", "t", "origin", "edges", "edge_weight", "hinged", "tangents", "tangent_weight", "directions", "prior", "prior_weight"),
     *("ground_weight", "ray", "depth", "depth_weight", "huber"),
 )
 
@@ -50,6 +52,12 @@ class BoxProblem:
     """(N, 4) 1 / sigma of the edges."""
     hinged: NDArray[np.bool_]
     """(N, 4) edges cut by the image border: the box must reach them and may go past."""
+    tangents: Array
+    """(N, K) reach of the vehicle along ``directions``, normalised coordinates; K may be 0."""
+    tangent_weight: Array
+    """(N, K) 1 / sigma of the tangents; 0 where there is none."""
+    directions: Array
+    """(N, K, 2) unit vectors of the tangents, normalised coordinates."""
     prior: Array
     """(N, 7) start position, predicted size, predicted yaw; states are compared with it as they are, so yaw is not wrapped."""
     prior_weight: Array
@@ -65,10 +73,10 @@ class BoxProblem:
     depth_weight: Array
     """(N,) 1 / sigma, 1/m; 0 where there is no reading."""
     huber: Array
-    """(N, 6) residual (sigmas) from which a row counts linearly."""
+    """(N, 6 + K) residual (sigmas) from which a row counts linearly."""
     shift_sigma: Array | None = None
-    """(N,) how far, normalised, the whole picture may be shifted along each axis, one sigma: left and right edge move
-    together, top and bottom too. None: not at all."""
+    """(N,) how far, normalised, the whole picture may be shifted along each axis, one sigma: all edges and tangents move
+    together. None: not at all."""
 
     def take(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> BoxProblem:
         """The boxes at an index or mask."""
@@ -104,7 +112,7 @@ def box_axes(yaw: Array) -> Array:
 
 def normal_equations(problem: BoxProblem, state: Array) -> NormalEquations:
     """Cost, gradient and Hessian at states (N, 7): Huber on the rows, squares on the prior."""
-    rows, shift = _whitened(problem, state)
+    rows, weight = _whitened(problem, state)
     residual, jacobian = rows[..., STATE_DIM], rows[..., :STATE_DIM]
     magnitude = np.abs(residual)
     robust = np.minimum(problem.huber / np.maximum(magnitude, _TINY), 1.0)
@@ -112,7 +120,7 @@ def normal_equations(problem: BoxProblem, state: Array) -> NormalEquations:
     weighted_t = (jacobian * robust[..., None]).transpose(0, 2, 1)
     cost = (inner * (magnitude - 0.5 * inner)).sum(1)
     if problem.shift_sigma is not None:
-        cost -= _free_shift(problem.shift_sigma, shift, robust, residual, weighted_t)
+        cost -= _free_shift(problem, weight, robust, residual, weighted_t)
     # One product gives the Hessian and, from the residual's column, the gradient.
     equations = weighted_t @ rows
     hessian, gradient = equations[..., :STATE_DIM], equations[..., STATE_DIM]
@@ -126,45 +134,45 @@ def normal_equations(problem: BoxProblem, state: Array) -> NormalEquations:
 
 
 def residuals(problem: BoxProblem, state: Array) -> tuple[Array, Array]:
-    """Whitened residuals (N, 6) and Jacobians (N, 6, 7) of everything but the prior, at states (N, 7)."""
+    """Whitened residuals (N, 6 + K) and Jacobians (N, 6 + K, 7) of everything but the prior, at states (N, 7)."""
     rows, _ = _whitened(problem, state)
     return rows[..., STATE_DIM], rows[..., :STATE_DIM]
 
 
 def _whitened(problem: BoxProblem, state: Array) -> tuple[Array, Array]:
-    """Rows (N, 6, 8), Jacobian and residual side by side, and the weights (N, 4) at which the edges count."""
-    rows = np.zeros((len(state), ROWS, STATE_DIM + 1))
+    """Rows (N, 6 + K, 8), Jacobian and residual side by side, and the weights (N, 4 + K) at which the outline counts."""
+    rows = np.zeros((len(state), FIXED_ROWS + problem.tangents.shape[1], STATE_DIM + 1))
     axes = box_axes(state[:, 6])
-    weight = _edge_rows(problem, state, axes, rows)
+    weight = _outline_rows(problem, state, axes, rows)
     _ground_row(problem, state, rows)
     if problem.depth_weight.any():
         _depth_row(problem, state, axes, rows)
     return rows, weight
 
 
-def _free_shift(sigma: Array, weight: Array, robust: Array, residual: Array, weighted_t: Array) -> Array:
-    """Let each picture shift by ``sigma`` (N,): takes from ``weighted_t`` (N, 7, 6), in place, what a shift explains.
+def _free_shift(problem: BoxProblem, weight: Array, robust: Array, residual: Array, weighted_t: Array) -> Array:
+    """Let each picture shift by its ``shift_sigma``: takes from ``weighted_t`` (N, 7, 6 + K), in place, what a shift explains.
 
-    ``weight`` (N, 4): how much an edge's residual changes with it. Returns what the cost (N,) loses by the best shift. Left
-    and right shift together, top and bottom too: W becomes W - W 1 (1/sigma^2 + 1' W 1)^-1 1' W for each of the pairs.
+    ``weight`` (N, 4 + K): how much the residuals of the outline change with it. Returns what the cost (N,) loses by the best
+    shift. With S (4 + K, 2), the change of the residuals with a shift, W becomes W - W S (1 / sigma^2 + S' W S)^-1 S' W.
     """
-    edges = weighted_t[..., EDGES]
-    pulls = robust[:, EDGES] * weight
-    scale = 1.0 / (_summed_pairs(pulls * weight) + 1.0 / (sigma * sigma)[:, None])
-    miss = _summed_pairs(pulls * residual[:, EDGES])
-    common = _summed_pairs(edges * weight[:, None]) * scale[:, None]
-    edges -= np.concatenate([common, common], 2) * pulls[:, None]
-    explained: Array = 0.5 * (scale * miss * miss).sum(1)
+    assert problem.shift_sigma is not None
+    moved = np.zeros((*weight.shape, 2))
+    moved[:, [0, 2], 0], moved[:, [1, 3], 1] = weight[:, [0, 2]], weight[:, [1, 3]]
+    moved[:, 4:] = problem.directions * weight[:, 4:, None]
+    pulled = moved * robust[:, OUTLINE, None]
+    information = pulled.transpose(0, 2, 1) @ moved
+    information[:, [0, 1], [0, 1]] += (1.0 / (problem.shift_sigma * problem.shift_sigma))[:, None]
+    scale = inverse_2x2(information)
+    miss = (residual[:, None, OUTLINE] @ pulled)[:, 0]
+    outline = weighted_t[..., OUTLINE]
+    outline -= outline @ moved @ scale @ pulled.transpose(0, 2, 1)
+    explained: Array = 0.5 * ((miss[:, None] @ scale)[:, 0] * miss).sum(1)
     return explained
 
 
-def _summed_pairs(edges: Array) -> Array:
-    """Left plus right, top plus bottom (..., 2) of values of the edges (..., 4)."""
-    return edges[..., :2] + edges[..., 2:]
-
-
-def _edge_rows(problem: BoxProblem, state: Array, axes: Array, rows: Array) -> Array:
-    """Each edge against the corner that makes it at this state (the active corner); returns the edges' weights (N, 4)."""
+def _outline_rows(problem: BoxProblem, state: Array, axes: Array, rows: Array) -> Array:
+    """Edges and tangents against the corner that each touches at this state (the active corner); returns weights (N, 4 + K)."""
     count, R = len(state), problem.R
     # World axes and box axes, one a column, in the camera's frame.
     columns = np.concatenate([R, R @ axes.transpose(0, 2, 1)], 2)
@@ -182,19 +190,28 @@ def _edge_rows(problem: BoxProblem, state: Array, axes: Array, rows: Array) -> A
     if problem.hinged.any():
         # A cut edge is content when the box goes past it: below it at the left and top, above it at the right and bottom.
         weight = np.where(problem.hinged & (miss * _OUTWARD > 0), 0.0, weight)
+    tangents = problem.tangents.shape[1]
+    if tangents:
+        reach = problem.directions @ image
+        touching = reach.argmax(2)
+        reached = reach.ravel().take(touching + 8 * np.arange(count * tangents).reshape(count, tangents))
+        active, seen = np.concatenate([active, touching], 1), np.concatenate([seen, reached], 1)
+        miss = np.concatenate([miss, reached - problem.tangents], 1)
+        weight = np.concatenate([weight, problem.tangent_weight], 1)
     # The image coordinate's gradient over the corner's position in the camera's frame, then over world and box axes.
-    over_corner = np.zeros((count, 4, 3))
+    over_corner = np.zeros((count, 4 + tangents, 3))
     scale = weight / depth.ravel().take(active + box)
-    over_corner[:, ::2, 0], over_corner[:, 1::2, 1] = scale[:, ::2], scale[:, 1::2]
+    over_corner[:, 0:4:2, 0], over_corner[:, 1:4:2, 1] = scale[:, 0:4:2], scale[:, 1:4:2]
+    over_corner[:, 4:, :2] = problem.directions * scale[:, 4:, None]
     over_corner[..., 2] = -seen * scale
     over = over_corner @ columns
     signs = _HALF_SIGNS.take(active, 0)
-    edges = rows[:, EDGES]
-    edges[..., :3] = over[..., :3]
-    edges[..., 3:6] = signs * over[..., 3:]
-    reach = signs[..., :2] * state[:, None, 3:5]
-    edges[..., 6] = reach[..., 0] * over[..., 4] - reach[..., 1] * over[..., 3]
-    edges[..., 7] = miss * weight
+    outline = rows[:, OUTLINE]
+    outline[..., :3] = over[..., :3]
+    outline[..., 3:6] = signs * over[..., 3:]
+    lever = signs[..., :2] * state[:, None, 3:5]
+    outline[..., 6] = lever[..., 0] * over[..., 4] - lever[..., 1] * over[..., 3]
+    outline[..., 7] = miss * weight
     return weight
 
 

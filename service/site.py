@@ -72,12 +72,30 @@ class CameraModel(_Strict):
     T_cam_world: Annotated[list[Row4], Field(min_length=4, max_length=4)]
 
 
+class AccuracyModel(_Strict):
+    """How exact the site's own numbers are, one sigma. What a survey promises; the defaults are those of ordinary roads and masts.
+
+    Exact numbers that are called vague cost accuracy, vague ones that are called exact cost more: boxes that belong together
+    then look apart.
+    """
+
+    ground_m: Annotated[float, Field(ge=0.001, le=10.0, allow_inf_nan=False)] = 0.05
+    """How far a wheel may stand above or below the ground, metres."""
+    ground_per_m: Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)] = 0.003
+    """What a metre of distance from the camera adds to it: roads are not planes."""
+    camera_m: Annotated[float, Field(ge=0.0, le=10.0, allow_inf_nan=False)] = 0.05
+    """Of a camera's position, metres."""
+    camera_rad: Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)] = 0.003
+    """Of a camera's rotation, radians: wind and warmth move masts, too."""
+
+
 class SiteModel(_Strict):
     """The form of ``site.json``, also the body of ``PUT /sites/{id}``."""
 
     id: Annotated[str, Field(pattern=ID_PATTERN)]
     origin: OriginModel = Field(default_factory=OriginModel)
     ground: GroundModel = Field(default_factory=GroundModel)
+    accuracy: AccuracyModel = Field(default_factory=AccuracyModel)
     cameras: Annotated[list[CameraModel], Field(max_length=64)] = Field(default_factory=list)
 
 
@@ -89,6 +107,7 @@ class Site:
     cameras: tuple[Camera, ...] = ()
     ground: Ground = field(default_factory=GroundPlane)
     origin: OriginModel = field(default_factory=OriginModel)
+    accuracy: AccuracyModel = field(default_factory=AccuracyModel)
 
     def camera(self, camera_id: str) -> Camera:
         """The camera with an id. Raises NotFoundError."""
@@ -133,7 +152,7 @@ def parse_site(document: Any) -> Site:
             raise CalibrationError(
                 f"'{camera_id}' stands twice.", field=f"cameras.{index}.id", remedy="Give each camera its own id."
             )
-    return Site(model.id, cameras, _ground(model.ground), model.origin)
+    return Site(model.id, cameras, _ground(model.ground), model.origin, model.accuracy)
 
 
 def _ground(model: GroundModel) -> Ground:
@@ -202,6 +221,7 @@ def site_document(site: Site) -> dict[str, Any]:
         "id": site.id,
         "origin": site.origin.model_dump(),
         "ground": _ground_document(site.ground),
+        "accuracy": site.accuracy.model_dump(),
         "cameras": [
             {
                 "id": c.id,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from models_export.data.detection import ANY_VEHICLE, IGNORED, MIN_SIDE_PX, VehicleSample, class_columns
 from models_export.data.pandaset import VEHICLE_CLASSES, VEHICLE_LIKE, PandasetBoxes, PandasetClip, open_pandaset
 from service.frames import decode
-from service.geometry.boxes import box_corners, clip_extents
+from service.geometry.boxes import box_corners, clip_extents, project_corners
 from service.geometry.camera import Camera, ray_azimuth
 from service.geometry.transforms import Array, transform_points, wrap_angle
 from service.nets.canvas import to_canvas
@@ -74,6 +74,7 @@ def pandaset_sample(clip: PandasetClip, camera_id: str, step: int, classes: tupl
         camera=camera,
         dims_lwh=boxes.dims_lwh[seen],
         alpha=wrap_angle(boxes.yaw[seen] - ray_azimuth(camera, (xyxy[:, :2] + xyxy[:, 2:]) / 2)),
+        corners_px=project_corners(camera, boxes.center[seen], boxes.dims_lwh[seen], boxes.yaw[seen])[0],
     )
 
 

@@ -53,9 +53,9 @@ class RealData:
         training, held_out = (pandaset_samples.load_pandaset(archive, classes, max_width, part) for part in steps)
         return training, held_out
 
-    def describe(self) -> dict[str, object]:
-        """For the manifest: sources and licences, and whether a teacher had a part in it."""
-        return {"real": list(ATTRIBUTIONS), "teacher": "NanoDet-g, COCO, Apache-2.0" if self.taught else None}
+    def credits(self) -> tuple[str, ...]:
+        """For checkpoint and manifest: sources and licences, the teacher's too where one had a part in it."""
+        return (*ATTRIBUTIONS, *(["teacher: NanoDet-g, COCO, Apache-2.0"] if self.taught else []))
 
     def _taught(self, roadside: Path) -> dict[str, Labels]:
         """By picture, what the teacher adds to the labels; labels of videos are all the teacher's."""

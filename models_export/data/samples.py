@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,10 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from models_export.data.dataset import UNKNOWN_CONDITION, Scene, list_scenes, open_scene
+from models_export.data.dataset import UNKNOWN_CONDITION, Scene, SceneTruth, list_scenes, open_scene
 from models_export.data.detection import MIN_SIDE_PX, VEHICLES, Still, VehicleSample, class_columns
 from service.errors import InputError
-from service.geometry.boxes import clip_extents, project_extents
+from service.geometry.boxes import clip_extents, project_corners, project_extents
 from service.geometry.camera import Camera, ray_azimuth
 from service.geometry.ground import Ground
 from service.geometry.transforms import Array, wrap_angle
@@ -70,21 +71,33 @@ def split_scenes(roots: Iterable[Path]) -> tuple[list[Path], list[Path]]:
 
 def load_samples(scenes: Iterable[Path], classes: tuple[str, ...], max_width: int, depth_stride: int) -> list[Sample]:
     """All frames of all cameras of scenes, in memory. classes: lower-case names, in the network's order."""
+    # Decoders let go of the interpreter's lock.
+    with ThreadPoolExecutor() as pool:
+        parts = pool.map(lambda path: _load_scene(open_scene(path), classes, max_width, depth_stride), scenes)
+        return [sample for part in parts for sample in part]
+
+
+def _load_scene(scene: Scene, classes: tuple[str, ...], max_width: int, depth_stride: int) -> list[Sample]:
     samples = []
-    for path in scenes:
-        scene = open_scene(path)
-        for step in range(scene.steps):
-            for camera_index, camera in enumerate(scene.site.cameras):
-                samples.append(_load_sample(scene, step, camera_index, camera, classes, max_width, depth_stride))
+    for step in range(scene.steps):
+        truth = scene.truth(step)
+        for camera_index, camera in enumerate(scene.site.cameras):
+            samples.append(_load_sample(scene, step, truth, camera_index, camera, classes, max_width, depth_stride))
     return samples
 
 
 def _load_sample(
-    scene: Scene, step: int, camera_index: int, camera: Camera, classes: tuple[str, ...], max_width: int, depth_stride: int
+    scene: Scene,
+    step: int,
+    truth: SceneTruth,
+    camera_index: int,
+    camera: Camera,
+    classes: tuple[str, ...],
+    max_width: int,
+    depth_stride: int,
 ) -> Sample:
     still = Still(scene.frame_bytes(camera.id, step), camera)
     image, scaled = still.at(max_width)
-    truth = scene.truth(step)
     extents, in_front = project_extents(scaled, truth.center, truth.dims_lwh, truth.yaw)
     kinds = np.array(truth.kinds, dtype=str)
     seen = in_front & (truth.visible[:, camera_index] > 0) & (np.isin(kinds, classes) | np.isin(kinds, VEHICLES))
@@ -104,6 +117,7 @@ def _load_sample(
         source=f"{SIMULATED}/{scene.world}",
         dims_lwh=truth.dims_lwh[seen],
         alpha=wrap_angle(truth.yaw[seen] - ray_azimuth(scaled, (xyxy[:, :2] + xyxy[:, 2:]) / 2)),
+        corners_px=project_corners(scaled, truth.center[seen], truth.dims_lwh[seen], truth.yaw[seen])[0],
         visible=visible,
         truncated=truncated,
         center=truth.center[seen],

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from models_export.data.dataset import UNKNOWN_CONDITION
 from models_export.data.detection import VehicleSample
-from service.geometry.boxes import clip_extents, scaled_extents
+from service.geometry.boxes import TANGENT_DIRECTIONS, clip_extents, scaled_extents, tangents_of
 from service.geometry.camera import Camera, ray_azimuth
 from service.geometry.transforms import Array, wrap_angle
 from service.nets.multibin import CONTEXT, crop_vehicles, crop_windows
 
-_ROOM = 1.5
+_ROOM = 1.7
 """Side of the kept picture over that of an exact crop: what jitter of the box may reach."""
-_MAX_PATCH_PX = 176
+_MAX_PATCH_PX = 224
 """Longer sides are reduced: crops are smaller still."""
 
 
@@ -33,6 +33,8 @@ class Vehicle:
     """(2,) pixels of the patch a pixel of the image, across and down."""
     xyxy_px: Array
     """(4,) extents of the projected box, clipped to the image, px of the image."""
+    tangents_px: Array
+    """(8,) reach of the projected box, not clipped, in ``TANGENT_DIRECTIONS``, px of the image."""
     alpha: float
     """Heading relative to the ray through the 2D box's centre, radians."""
     dims_lwh: Array
@@ -52,7 +54,8 @@ class Vehicle:
     def crop(self, xyxy_px: Array, crop_px: int) -> tuple[NDArray[np.uint8], float, Array]:
         """What the head would see and should say of a box (4,) that is not exact.
 
-        Returns the crop (S, S, 3), alpha about that box's centre, and the true edges (4,) in the crop's sides from its middle.
+        Returns the crop (S, S, 3), alpha about that box's centre, and the true edges and tangents (12,) in the crop's sides from
+        its middle.
         """
         centers = np.stack([(self.xyxy_px[:2] + self.xyxy_px[2:]) / 2, (xyxy_px[:2] + xyxy_px[2:]) / 2])
         azimuth = ray_azimuth(self.camera, centers)
@@ -62,7 +65,10 @@ class Vehicle:
         crop = crop_vehicles(self.patch, in_patch[:1], crop_px)[0]
         left, top, side = crop_windows(in_patch[:1])[0].astype(np.float64)
         edges = (in_patch[1] + 0.5 - np.array([left, top] * 2)) / side - 0.5
-        return crop, alpha, edges
+        # The crop's middle in the image; a patch is scaled alike across and down, up to rounding.
+        middle = (np.array([left, top]) + 0.5 * side) / self.patch_scale + self.patch_origin_px
+        tangents = (self.tangents_px - TANGENT_DIRECTIONS @ middle) / (side / self.patch_scale.mean())
+        return crop, alpha, np.concatenate([edges, tangents])
 
 
 def vehicles_of(sample: VehicleSample, max_width: int | None = None) -> list[Vehicle]:
@@ -75,14 +81,24 @@ def vehicles_of(sample: VehicleSample, max_width: int | None = None) -> list[Veh
     image, camera = sample.canvas[:height, :width], sample.camera
     if max_width is not None and sample.still is not None:
         image, camera = sample.still.at(max_width)
-    boxes = clip_extents(camera, scaled_extents(sample.xyxy_px, (image.shape[1] / width, image.shape[0] / height)))
+    factor = np.array([image.shape[1] / width, image.shape[0] / height])
+    boxes = clip_extents(camera, scaled_extents(sample.xyxy_px, factor))
+    tangents = tangents_of((sample.corners_px + 0.5) * factor - 0.5)
     weather = sample.labels.get("weather", UNKNOWN_CONDITION)
     rows = np.flatnonzero(~sample.ignore & sample.class_known)
-    return [_cut(image, camera, boxes[row], sample, row, weather) for row in rows]
+    return [_cut(image, camera, boxes[row], tangents[row], sample, row, weather) for row in rows]
 
 
-def _cut(image: NDArray[np.uint8], camera: Camera, xyxy_px: Array, sample: VehicleSample, row: int, weather: str) -> Vehicle:
-    """The vehicle in a row of a sample, whose box (4,) is ``xyxy_px`` in an image of the camera's size."""
+def _cut(
+    image: NDArray[np.uint8],
+    camera: Camera,
+    xyxy_px: Array,
+    tangents_px: Array,
+    sample: VehicleSample,
+    row: int,
+    weather: str,
+) -> Vehicle:
+    """The vehicle in a row of a sample, whose box (4,) and tangents (8,) are those in an image of the camera's size."""
     half = 0.5 * _ROOM * CONTEXT * float((xyxy_px[2:] - xyxy_px[:2]).max())
     center = (xyxy_px[:2] + xyxy_px[2:]) / 2
     x0, y0 = np.maximum(np.floor(center - half), 0).astype(int)
@@ -96,6 +112,7 @@ def _cut(image: NDArray[np.uint8], camera: Camera, xyxy_px: Array, sample: Vehic
         patch_origin_px=np.array([x0, y0]) - 0.5,
         patch_scale=np.array([patch.shape[1] / (x1 - x0), patch.shape[0] / (y1 - y0)]),
         xyxy_px=xyxy_px,
+        tangents_px=tangents_px,
         alpha=float(sample.alpha[row]),
         dims_lwh=sample.dims_lwh[row],
         cls=int(sample.cls[row]),

@@ -11,20 +11,23 @@ from torch import Tensor, nn
 from models_export.nets.blocks import Normalise, conv
 
 
+_POOLED = 4
+
+
 @dataclass(frozen=True)
 class DepthConfig:
     """Shape of the depth net."""
 
-    stem: tuple[int, int, int, int] = (16, 32, 64, 128)
-    """Channels at strides 4, 8, 16, 32 of the canvas."""
-    width: int = 128
+    stem: tuple[int, int, int] = (24, 48, 96)
+    """Channels at strides 8, 16, 32 of the canvas."""
+    width: int = 96
     """Channels of a token."""
-    blocks: int = 3
+    blocks: int = 2
     heads: int = 4
     mlp_ratio: int = 2
     decoder: int = 24
     """Channels of the decoder."""
-    stride: int = 8
+    stride: int = 16
     """Canvas pixels an output cell; fixed by the decoder's plan."""
 
 
@@ -61,7 +64,7 @@ class Block(nn.Module):
 
 
 class EdgeDepth(nn.Module):
-    """uint8 canvases (B, H, W, 3) to affine-invariant inverse depth (B, H / 8, W / 8).
+    """uint8 canvases (B, H, W, 3) to affine-invariant inverse depth (B, H / 16, W / 16).
 
     Positions enter through a zero-padded depth-wise convolution over the token grid, so any canvas size fits one graph.
     """
@@ -69,13 +72,12 @@ class EdgeDepth(nn.Module):
     def __init__(self, config: DepthConfig) -> None:
         super().__init__()
         self.config = config
-        c4, c8, c16, c32 = config.stem
+        c8, c16, c32 = config.stem
         d = config.decoder
         self.normalise = Normalise()
-        # The half-size picture is enough for depth, and pooling is the cheapest way to it.
-        self.stem4 = nn.Sequential(nn.AvgPool2d(2), conv(3, c4, 3, 2))
-        self.stem8 = nn.Sequential(conv(c4, c8, 3, 2), conv(c8, c8))
-        self.stem16 = conv(c8, c16, 3, 2)
+        # A picture of a quarter the size is enough for depth, and pooling is the cheapest way to it.
+        self.stem8 = nn.Sequential(nn.AvgPool2d(_POOLED), conv(3, c8, 3, 2))
+        self.stem16 = nn.Sequential(conv(c8, c16, 3, 2), conv(c16, c16))
         self.stem32 = conv(c16, c32, 3, 2)
         self.embed = nn.Conv2d(c32, config.width, 1)
         self.position = nn.Conv2d(config.width, config.width, 5, padding=2, groups=config.width)
@@ -83,28 +85,26 @@ class EdgeDepth(nn.Module):
         self.norm = nn.LayerNorm(config.width)
         self.upsample = nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False)
         self.from32 = nn.Conv2d(config.width, d, 1)
-        self.from16, self.from8 = nn.Conv2d(c16, d, 1), nn.Conv2d(c8, d, 1)
-        self.fuse16, self.fuse8 = conv(d, d), conv(d, d)
+        self.from16, self.fuse16 = nn.Conv2d(c16, d, 1), conv(d, d)
         self.head = nn.Conv2d(d, 1, 3, padding=1)
 
     def with_folded_pooling(self) -> EdgeDepth:
         """A copy in which the pooling is part of the first convolution, with the same outputs: for export.
 
-        Pooling over uint8 pixels is slow where a convolution is fast. A 3x3 kernel of stride 2 over 2x2 means is a 6x6 kernel
-        of stride 4 whose taps are a quarter each.
+        Pooling over uint8 pixels is slow where a convolution is fast. A 3x3 kernel of stride 2 over 4x4 means is a 12x12 kernel
+        of stride 8 whose taps are a sixteenth each.
         """
         folded = deepcopy(self)
-        first = folded.stem4[1][0]
-        wide = nn.Conv2d(first.in_channels, first.out_channels, 6, 4, 2, bias=False)
-        wide.weight = nn.Parameter(first.weight.detach().repeat_interleave(2, 2).repeat_interleave(2, 3) / 4)
-        folded.stem4[0], folded.stem4[1][0] = nn.Identity(), wide
+        first = folded.stem8[1][0]
+        wide = nn.Conv2d(first.in_channels, first.out_channels, 3 * _POOLED, 2 * _POOLED, _POOLED, bias=False)
+        taps = first.weight.detach().repeat_interleave(_POOLED, 2).repeat_interleave(_POOLED, 3)
+        wide.weight = nn.Parameter(taps / _POOLED**2)
+        folded.stem8[0], folded.stem8[1][0] = nn.Identity(), wide
         return folded
 
     def forward(self, images: Tensor) -> Tensor:
         """H and W are multiples of 32."""
-        f4 = self.stem4(self.normalise(images))
-        f8 = self.stem8(f4)
-        f16 = self.stem16(f8)
+        f16 = self.stem16(self.stem8(self.normalise(images)))
         grid = self.embed(self.stem32(f16))
         grid = grid + self.position(grid)
         batch, width, rows, columns = grid.shape
@@ -113,5 +113,4 @@ class EdgeDepth(nn.Module):
             tokens = block(tokens)
         grid = self.norm(tokens).transpose(1, 2).reshape(batch, width, rows, columns)
         x = self.fuse16(self.upsample(self.from32(grid)) + self.from16(f16))
-        x = self.fuse8(self.upsample(x) + self.from8(f8))
         return self.head(x).squeeze(1)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
-from models_export.nets.blocks import Normalise, conv, stage, start_with_rare_objects
+from models_export.nets.blocks import Normalise, conv, patches, stage, start_with_rare_objects
 from service.nets.decoding import BOX_FIELDS
 
 
@@ -24,10 +24,10 @@ class DetectorConfig:
     """Per stride, (width, height) of each anchor, px; k-means of the training boxes replaces these."""
     max_width: int = 672
     """Widest image that the detector is given, px."""
-    channels: tuple[int, ...] = (16, 32, 64, 128, 192)
-    """Channels after the stem and after each stage (strides 2, 4, 8, 16, 32)."""
-    residuals: tuple[int, ...] = (1, 2, 3, 2)
-    """Residual blocks of the stages at strides 4, 8, 16, 32."""
+    channels: tuple[int, int, int, int] = (32, 64, 128, 256)
+    """Channels after the stem and after each stage (strides 4, 8, 16, 32)."""
+    residuals: tuple[int, int, int] = (2, 3, 2)
+    """Residual blocks of the stages at strides 8, 16, 32."""
 
 
 class EdgeDetector(nn.Module):
@@ -36,13 +36,12 @@ class EdgeDetector(nn.Module):
     def __init__(self, config: DetectorConfig) -> None:
         super().__init__()
         self.config = config
-        c2, c4, c8, c16, c32 = config.channels
+        c4, c8, c16, c32 = config.channels
         self.normalise = Normalise()
-        self.stem = conv(3, c2, 3, 2)
-        self.stage4 = stage(c2, c4, config.residuals[0])
-        self.stage8 = stage(c4, c8, config.residuals[1])
-        self.stage16 = stage(c8, c16, config.residuals[2])
-        self.stage32 = stage(c16, c32, config.residuals[3])
+        self.stem = patches(c4)
+        self.stage8 = stage(c4, c8, config.residuals[0])
+        self.stage16 = stage(c8, c16, config.residuals[1])
+        self.stage32 = stage(c16, c32, config.residuals[2])
         neck = c8
         self.lateral32 = conv(c32, neck, 1)
         self.lateral16 = conv(c16, neck, 1)
@@ -57,7 +56,7 @@ class EdgeDetector(nn.Module):
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Heads at strides 8, 16, 32; H and W are multiples of 32."""
-        f8 = self.stage8(self.stage4(self.stem(self.normalise(images))))
+        f8 = self.stage8(self.stem(self.normalise(images)))
         f16 = self.stage16(f8)
         f32 = self.stage32(f16)
         p32 = self.lateral32(f32)

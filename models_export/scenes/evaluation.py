@@ -111,7 +111,7 @@ def _description(plan: ScenePlan) -> object:
     return _rounded(
         {
             "scene": scene_document(plan),
-            "site": site_document(plan.site),
+            "site": _site_description(plan),
             "light": vars(plan.light),
             "films": [vars(film) for film in plan.films],
             "lamps": plan.lamp_heads,
@@ -119,6 +119,13 @@ def _description(plan: ScenePlan) -> object:
             "moments": [_moment_description(moment) for moment in plan.moments()],
         }
     )
+
+
+def _site_description(plan: ScenePlan) -> dict[str, object]:
+    """The site's numbers. How exact it calls them changes neither pictures nor truth."""
+    document = site_document(plan.site)
+    del document["accuracy"]
+    return document
 
 
 def _moment_description(moment: Moment) -> dict[str, object]:

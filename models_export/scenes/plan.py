@@ -20,10 +20,12 @@ from models_export.scenes.scenario import ROTATION_THRESHOLD_RAD, rotation_from_
 from models_export.scenes.surroundings import furnish
 from models_export.scenes.traffic import Traffic, Vehicle
 from service.geometry.transforms import rotation_z, wrap_angle
-from service.site import OriginModel, Site
+from service.site import AccuracyModel, Site
 
 START_NS = 1_767_225_600_000_000_000
 """Capture time of every scene's first step: 2026-01-01T00:00:00Z."""
+EXACT = AccuracyModel(ground_m=0.02, ground_per_m=0.0, camera_m=0.01, camera_rad=0.0003)
+"""Of every site: what is drawn is what its numbers say, up to half a pixel."""
 _CROWDED = 0.15
 """Share of hard scenes that are hard by occlusion, in clear weather."""
 _TURNING, _NEAR_M = 3, 45.0
@@ -91,7 +93,7 @@ class ScenePlan:
             Optics(request.size, request.distorted),
             camera_rng,
         )
-        self.site = Site(f"scene-{request.seed}", cameras, origin=OriginModel())
+        self.site = Site(f"scene-{request.seed}", cameras, accuracy=EXACT)
         self.films: tuple[Film, ...] = tuple(sample_film(light_rng, self.light, request.quality) for _ in cameras)
         self._world = world
 

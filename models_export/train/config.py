@@ -53,7 +53,8 @@ class TrainConfig:
     threads: int = 1
     """CPU threads of the arithmetic. One loses little against two at these sizes, and two trainings run side by side."""
     workers: int = 1
-    """Batches that are prepared at the same time, on threads. A GPU wants several; batches are the same for any number."""
+    """Batches that are prepared at the same time: on threads of a CPU run, in processes beside a GPU, which wants many. Batches
+    are the same for any number."""
     amp: bool = True
     """Autocast: bfloat16 is three times as fast on CPUs with AMX, harmless elsewhere."""
     amp_dtype: AmpType = "bfloat16"
@@ -74,6 +75,8 @@ class TrainConfig:
     """Items of each camera and of each weather that validate, at most."""
     init: str | None = None
     """Name of the file or folder whose weights training starts from, for the record."""
+    recordings: tuple[str, ...] = ()
+    """Real recordings that train too, with their authors and licences, for the record."""
 
     def __post_init__(self) -> None:
         if (self.steps is None) == (self.epochs is None):

@@ -34,7 +34,7 @@ class DepthTask:
         build: Callable[[Any], nn.Module] = EdgeDepth,
     ) -> None:
         """build: the depth net of a configuration. The samples' inverse depth is at the stride of ``config``."""
-        self.samples = samples
+        self.samples, self.like = samples, _by_size(samples)
         self.config = config
         self.augment = augment or AugmentConfig()
         self.net = build(config)
@@ -49,12 +49,14 @@ class DepthTask:
     def held_out(self, samples: list[Sample]) -> DepthTask:
         """The same network and configuration over other samples, which are not augmented: for validation."""
         other = copy(self)
-        other.samples, other.augment = samples, NO_AUGMENT
+        other.samples, other.like, other.augment = samples, _by_size(samples), NO_AUGMENT
         return other
 
     def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.int64]:
-        """Every frame is as likely as the others."""
-        return draw_uniform(rng, len(self), size)
+        """A frame as likely as the others, and more of its size: a batch has one."""
+        (first,) = draw_uniform(rng, len(self), 1)
+        like = self.like[self.samples[first].canvas.shape]
+        return np.concatenate([[first], rng.choice(like, size - 1)])
 
     def labels(self, index: int) -> dict[str, str]:
         """Camera and weather of a frame."""
@@ -82,6 +84,14 @@ class DepthTask:
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
         """Trimmed scale-and-shift-invariant loss plus gradient matching, over cells of known depth."""
         return depth_loss(net(batch["images"]).float(), batch["targets"], batch["targets"] > 0)
+
+
+def _by_size(samples: list[Sample]) -> dict[tuple[int, ...], list[int]]:
+    """Indices of samples by the size of their canvases."""
+    groups: dict[tuple[int, ...], list[int]] = {}
+    for index, sample in enumerate(samples):
+        groups.setdefault(sample.canvas.shape, []).append(index)
+    return groups
 
 
 def _flip_map(target: np.ndarray, columns: int) -> np.ndarray:

@@ -24,7 +24,7 @@ MAX_RATIO = 4.0
 """An anchor answers for a box whose sides differ from its own by less than this factor: what (2 sigmoid)^2 can reach."""
 SCALE_BALANCE = (4.0, 1.0, 0.4)
 """Weights of the objectness of the strides: fine grids hold more cells, and smaller vehicles."""
-BOX_WEIGHT, OBJECT_WEIGHT, CLASS_WEIGHT = 0.05, 1.0, 0.2
+BOX_WEIGHT, OBJECT_WEIGHT, CLASS_WEIGHT = 0.1, 1.0, 0.2
 
 
 class DetectorTask(BoxTask):

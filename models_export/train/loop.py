@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from time import monotonic
@@ -16,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from models_export.train.batches import batches
 from models_export.train.checkpoint import read_checkpoint, require_same, write_checkpoint
 from models_export.train.config import TrainConfig, decisive
 from models_export.train.curves import write_curves
@@ -42,7 +41,7 @@ def fit(task: Task, config: TrainConfig, out: Path, validation: Task | None = No
     started, steps = monotonic(), config.steps or 0
     with _progress() as progress:
         bar = progress.add_task(task.name, total=steps, completed=run.step, loss="")
-        for batch in _batches(task, config, run.step):
+        for batch in batches(task, config, run.step):
             minutes = (monotonic() - started) / 60
             if config.max_minutes is not None and minutes >= config.max_minutes:
                 break
@@ -148,25 +147,6 @@ def _optimizer(groups: list[ParameterGroup], config: TrainConfig) -> torch.optim
         return torch.optim.SGD(weights, lr=config.learning_rate, momentum=config.momentum)
     kind = torch.optim.AdamW if config.optimizer == "adamw" else torch.optim.Adam
     return kind(weights, lr=config.learning_rate)
-
-
-def _batches(task: Task, config: TrainConfig, start: int) -> Iterator[Batch]:
-    """The batches of the steps from ``start`` on, in order, ``config.workers`` of them in preparation."""
-    assert config.steps is not None, "epochs are resolved before training"
-    with ThreadPoolExecutor(config.workers) as pool:
-        ahead: deque[Future[Batch]] = deque()
-        for step in range(start, config.steps):
-            ahead.append(pool.submit(_batch, task, config, step))
-            if len(ahead) > config.workers:
-                yield ahead.popleft().result()
-        while ahead:
-            yield ahead.popleft().result()
-
-
-def _batch(task: Task, config: TrainConfig, step: int) -> Batch:
-    # One generator a step: a resumed run draws the batches that the whole run would have drawn.
-    rng = np.random.default_rng((config.seed, step))
-    return task.batch(task.draw(rng, config.batch_size), rng)
 
 
 def _step_seed(seed: int, step: int) -> int:

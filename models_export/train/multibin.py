@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import asdict, replace
 from typing import Any
@@ -15,16 +16,23 @@ from torch import Tensor, nn
 from models_export.data.augment import NO_AUGMENT, AugmentConfig, photometric
 from models_export.data.detection import VehicleSample
 from models_export.data.vehicles import Vehicle, vehicles_of
-from models_export.losses import likelihood_loss, multibin_loss
-from models_export.nets.multibin import SIGMA_UNITS, EdgeMultibin, MultibinConfig
+from models_export.losses import likelihood_loss, multibin_loss, places_loss
+from models_export.nets.multibin import SIGMA_UNITS, EdgeMultibin, MultibinConfig, outline_places
 from models_export.nets.vgg_multibin import VggMultibinConfig
 from models_export.train.task import Batch, ParameterGroup, decayed_groups, draw_uniform
+from service.geometry.boxes import TANGENT_DEGREES
 from service.geometry.transforms import Array
 
-JITTER, MAX_JITTER = 0.06, 0.15
+JITTER, MAX_JITTER = 0.08, 0.2
 """Standard deviation and limit of a box edge in training over the box's side: the detector's boxes are not exact either."""
-SIZE_WEIGHT = 6.0
-"""Of the size's likelihood, over angle's and edges': at 1 the head learned little more of a size than its class's mean."""
+SIZE_WEIGHT, OUTLINE_WEIGHT, PLACES_WEIGHT = 4.0, 2.0, 6.0
+"""Of the likelihoods of size and outline, and of the outline's places, over the angle's. At 1 the head learned little more of a size than its class's mean; the
+outline is what the lift takes sizes and places from."""
+CROP_AUGMENT = AugmentConfig(motion_px=4, jpeg_quality=(40, 95), noise_sigma=8.0, night=0.06, fog=0.06)
+"""Milder than a picture's: a crop is a few dozen pixels of it, and streaks and blocks do not shrink with it."""
+_MIRRORED = [2, 1, 0, 3, *(4 + TANGENT_DEGREES.index((180 - angle) % 360) for angle in TANGENT_DEGREES)]
+_MIRRORED_SIGN = [-1.0, 1.0, -1.0, 1.0, *(1.0,) * len(TANGENT_DEGREES)]
+"""Where each reading of the outline comes from in the mirror, and its sign: edges are coordinates, tangents lengths."""
 
 
 class MultibinTask:
@@ -43,7 +51,7 @@ class MultibinTask:
         """build: the head of a configuration, which gets the vehicles' mean sizes as its priors."""
         self.vehicles = _vehicles(samples, config)
         self.config = replace(config, mean_dims_lwh=mean_dims(self.vehicles, len(config.classes)))
-        self.augment = augment or AugmentConfig()
+        self.augment = augment or CROP_AUGMENT
         self.net = build(self.config)
 
     def describe(self) -> dict[str, Any]:
@@ -72,42 +80,50 @@ class MultibinTask:
         return decayed_groups(net)
 
     def batch(self, indices: NDArray[np.int64], rng: np.random.Generator) -> Batch:
-        """Crops (N, S, S, 3) uint8, alpha (N,), size residuals (N, 3) metres, edges (N, 4) in sides of the crop."""
-        crops, alphas, residuals, edges = [], [], [], []
+        """Crops (N, S, S, 3) uint8, alpha (N,), size residuals (N, 3) metres, outline (N, 12) in sides of the crop."""
+        crops, alphas, residuals, outlines = [], [], [], []
         means = np.array(self.config.mean_dims_lwh)
         for index in indices:
             vehicle = self.vehicles[index]
-            crop, alpha, edge = vehicle.crop(jittered(vehicle.xyxy_px, rng), self.config.crop_px)
+            crop, alpha, outline = vehicle.crop(jittered(vehicle.xyxy_px, rng), self.config.crop_px)
             if rng.random() < self.augment.flip:
-                crop, alpha, edge = crop[:, ::-1], -alpha, edge[[2, 1, 0, 3]] * [-1, 1, -1, 1]
+                crop, alpha, outline = crop[:, ::-1], -alpha, mirrored_outline(outline)
             crops.append(photometric(crop, rng, self.augment))
             alphas.append(alpha)
             residuals.append(vehicle.dims_lwh - means[vehicle.cls])
-            edges.append(edge)
-        arrays = {"alpha": alphas, "residuals": residuals, "edges": edges}
+            outlines.append(outline)
+        arrays = {"alpha": alphas, "residuals": residuals, "outline": outlines}
         tensors = {name: torch.tensor(np.array(values), dtype=torch.float32) for name, values in arrays.items()}
         return {"crops": torch.from_numpy(np.stack(crops)), **tensors}
 
     def loss(self, net: nn.Module, batch: Batch) -> dict[str, Tensor]:
-        """The paper's equations 2 and 3; of a head that predicts more, also the likelihood of angle, size and edges."""
-        vectors, confidence, residual, *more = (out.float() for out in net(batch["crops"]))
+        """The paper's equations 2 and 3; of a head that predicts more, also the likelihood of angle, size and outline."""
+        found = net.with_places(batch["crops"]) if isinstance(net, EdgeMultibin) else net(batch["crops"])
+        vectors, confidence, residual, *more = (out.float() for out in found)
         centers = torch.tensor(self.config.bin_centers_rad, device=vectors.device)
         alpha, residuals = batch["alpha"], batch["residuals"]
         paper = multibin_loss(vectors, confidence, residual, alpha, residuals, centers, self.config.bin_overlap_rad)
         if not more:
             return paper
-        edges, log_sigma = more
+        outline, log_sigma, logits = more
         turn = angle_error(vectors, alpha, centers)
-        errors = torch.cat([turn[:, None], residual - residuals, edges - batch["edges"]], 1)
+        errors = torch.cat([turn[:, None], residual - residuals, outline - batch["outline"]], 1)
         units = torch.tensor(SIGMA_UNITS, device=errors.device)
         terms = likelihood_loss(errors / units, log_sigma - units.log()).mean(0)
-        likelihood = {"angle_nll": terms[0], "size_nll": terms[1:4].mean(), "edge_nll": terms[4:].mean()}
-        total = paper["total"] + likelihood["angle_nll"] + SIZE_WEIGHT * likelihood["size_nll"] + likelihood["edge_nll"]
-        return {**paper, **likelihood, "total": total}
+        likelihood = {"angle_nll": terms[0], "size_nll": terms[1:4].mean(), "outline_nll": terms[4:].mean()}
+        places = places_loss(logits, batch["outline"], outline_places().to(logits.device)).mean()
+        weighted = (
+            SIZE_WEIGHT * likelihood["size_nll"] + OUTLINE_WEIGHT * likelihood["outline_nll"] + PLACES_WEIGHT * places
+        )
+        total = paper["total"] + likelihood["angle_nll"] + weighted
+        return {**paper, **likelihood, "places": places, "total": total}
 
 
 def _vehicles(samples: Sequence[VehicleSample], config: MultibinConfig | VggMultibinConfig) -> list[Vehicle]:
-    return [vehicle for sample in samples for vehicle in vehicles_of(sample, config.max_width)]
+    # Decoders let go of the interpreter's lock.
+    with ThreadPoolExecutor() as pool:
+        parts = pool.map(lambda sample: vehicles_of(sample, config.max_width), samples)
+        return [vehicle for part in parts for vehicle in part]
 
 
 def angle_error(vectors: Tensor, alpha: Tensor, bin_centers: Tensor) -> Tensor:
@@ -125,6 +141,12 @@ def mean_dims(vehicles: list[Vehicle], classes: int) -> tuple[tuple[float, float
     cls = np.array([v.cls for v in vehicles])
     rows = [dims[cls == c] if np.any(cls == c) else dims for c in range(classes)]
     return tuple((float(m[0]), float(m[1]), float(m[2])) for m in (np.round(r.mean(0), 4) for r in rows))
+
+
+def mirrored_outline(outline: Array) -> Array:
+    """Edges and tangents (12,) of a crop, about its middle, when it is mirrored left to right."""
+    mirrored: Array = outline[_MIRRORED] * _MIRRORED_SIGN
+    return mirrored
 
 
 def jittered(xyxy_px: Array, rng: np.random.Generator) -> Array:

@@ -20,6 +20,11 @@ CORNER_SIGNS = np.array([[sx, sy, sz] for sz in (-1, 1) for sx, sy in ((1, 1), (
 BORDER_PX = 2.0
 """An edge of a 2D box this near to the image border counts as cut by it."""
 
+TANGENT_DEGREES = (30, 60, 120, 150, 210, 240, 300, 330)
+"""Directions in the image, clockwise from right, in which a vehicle's reach is read besides those of its 2D box's edges."""
+TANGENT_DIRECTIONS = np.stack([np.cos(np.radians(TANGENT_DEGREES)), np.sin(np.radians(TANGENT_DEGREES))], 1)
+"""(8, 2) their unit vectors: right, down."""
+
 STATE_DIM = 7
 """x, y, z, length, width, height, yaw."""
 
@@ -103,10 +108,24 @@ def project_extents(camera: Camera, center: ArrayLike, dims_lwh: ArrayLike, yaw:
     Returns xyxy (N, 4) in px, not clipped to the image, and in_front (N,): all eight corners before the camera. Where
     in_front is False the extents are not meaningful.
     """
-    corners_cam = transform_points(camera.T_cam_world, box_corners(center, dims_lwh, yaw))
-    pixels = camera.project_cam(corners_cam)
-    in_front = np.all(corners_cam[..., 2] > MIN_DEPTH_M, axis=-1)
+    pixels, in_front = project_corners(camera, center, dims_lwh, yaw)
     return np.concatenate([pixels.min(axis=-2), pixels.max(axis=-2)], -1), in_front
+
+
+def project_corners(camera: Camera, center: ArrayLike, dims_lwh: ArrayLike, yaw: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+    """Corners (N, 8, 2) of boxes in a camera, px, in the order of ``CORNER_SIGNS``, and in_front (N,), as ``project_extents``."""
+    corners_cam = transform_points(camera.T_cam_world, box_corners(center, dims_lwh, yaw))
+    return camera.project_cam(corners_cam), np.all(corners_cam[..., 2] > MIN_DEPTH_M, axis=-1)
+
+
+def tangents_of(points_px: ArrayLike) -> Array:
+    """How far points (..., P, 2) reach in each of ``TANGENT_DIRECTIONS``: (..., 8) px, the largest product with the direction.
+
+    A straight line at this distance from the image's origin, square to the direction, touches the points from outside. With
+    the four edges these are twelve tangents, which pin down the outline of a projected box.
+    """
+    reach: Array = (np.asarray(points_px, dtype=np.float64) @ TANGENT_DIRECTIONS.T).max(-2)
+    return reach
 
 
 def cut_edges(camera: Camera, xyxy_px: ArrayLike, border_px: float = BORDER_PX) -> NDArray[np.bool_]:

@@ -56,6 +56,16 @@ def transform_points(T: ArrayLike, points: ArrayLike) -> Array:
     return moved
 
 
+def inverse_2x2(matrices: Array) -> Array:
+    """Inverses of symmetric, positive definite matrices (N, 2, 2); in closed form, several times quicker than LAPACK's."""
+    xx, xy, yy = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
+    inverse = np.empty_like(matrices)
+    scale = 1.0 / (xx * yy - xy * xy)
+    inverse[:, 0, 0], inverse[:, 1, 1] = yy * scale, xx * scale
+    inverse[:, 0, 1] = inverse[:, 1, 0] = -xy * scale
+    return inverse
+
+
 def pole_camera_pose(position_m: ArrayLike, heading_rad: float, pitch_rad: float, roll_rad: float = 0.0) -> Array:
     """``T_cam_world`` (4, 4) of a camera on a pole.
 

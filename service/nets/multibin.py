@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from service.errors import PackError
+from service.geometry.boxes import TANGENT_DEGREES, TANGENT_DIRECTIONS
 from service.geometry.transforms import Array, wrap_angle
 from service.nets.canvas import PAD_VALUE
 from service.nets.error_model import ErrorModel
 from service.nets.pack import Network
 
-CONTEXT = 1.2
+CONTEXT = 1.3
 """Side of the square crop over the longer side of the 2D box: a margin, and the box's shape kept."""
 
 UNCERTAIN = ("alpha", "length", "width", "height", "left", "top", "right", "bottom")
-"""Order of the standard deviations that a head may predict: radians, metres, and sides of the crop."""
-_EDGES = slice(4, 8)
+"""Order of the standard deviations that a head may predict: radians, metres, and sides of the crop. Those of the tangents, where
+it reads them too, come after, one for each of ``TANGENT_DEGREES``."""
+OUTLINE = slice(4, None)
+"""Of these, the edges and tangents: lengths in the image."""
+EDGES = 4
+"""The first readings of the outline are the edges."""
 _MIN_WINDOW_PX = 4.0
 _MAX_SHRINK = 4
 _MIN_LENGTH = 0.1
@@ -42,8 +47,8 @@ class MultibinSpec:
     max_width: int | None = None
     """Crops are cut from images of at most this width, px; None: from those that the detector sees."""
     sigma_scale: Array | None = None
-    """(8,) what predicted standard deviations of ``UNCERTAIN`` are multiplied by, measured on validation scenes; None: the head
-    predicts none, and no edges."""
+    """(8 or 16,) what predicted standard deviations of ``UNCERTAIN`` and tangents are multiplied by, measured on validation
+    scenes; None: the head predicts none, and no outline."""
 
     def sigmas(self, estimates: MultibinEstimates, score: ArrayLike, is_cut: ArrayLike) -> tuple[Array, Array]:
         """Standard deviations of alpha (N,), radians, and of length, width and height (N, 3), metres.
@@ -66,19 +71,23 @@ class MultibinSpec:
                 sigma_dims_lwh=tuple(ErrorModel.from_metadata(row) for row in metadata["sigma_dims_lwh"]),  # type: ignore[attr-defined]
                 sigma_alpha_rad=ErrorModel.from_metadata(metadata["sigma_alpha_rad"]),
                 max_width=int(metadata["max_width"]) if "max_width" in metadata else None,  # type: ignore[call-overload]
-                sigma_scale=_sigma_scale(metadata.get("sigma_scale")),
+                sigma_scale=_sigma_scale(metadata.get("sigma_scale"), metadata.get("tangents_deg", ())),
             )
         except (KeyError, TypeError, ValueError) as error:
             raise PackError(f"metadata is incomplete: {error!r}.", field="multibin", remedy="Export the pack again.") from error
 
 
-def _sigma_scale(values: object) -> Array | None:
-    """Factors (8,) from metadata. Raises ValueError when they are not positive numbers, one for each of ``UNCERTAIN``."""
+def _sigma_scale(values: object, tangents_deg: object) -> Array | None:
+    """Factors (8,) or (16,) from metadata. Raises ValueError when they are not positive numbers, one for each standard deviation,
+    or when the tangents' directions are others than the service's."""
+    if tuple(tangents_deg) not in ((), TANGENT_DEGREES):  # type: ignore[arg-type]
+        raise ValueError(f"tangents_deg {tangents_deg!r}: {TANGENT_DEGREES} are expected")
     if values is None:
         return None
     scale = np.asarray(values, dtype=np.float64)
-    if scale.shape != (len(UNCERTAIN),) or not (np.isfinite(scale).all() and (scale > 0).all()):
-        raise ValueError(f"sigma_scale {values!r}: {len(UNCERTAIN)} positive numbers are expected")
+    count = len(UNCERTAIN) + len(tuple(tangents_deg))  # type: ignore[arg-type]
+    if scale.shape != (count,) or not (np.isfinite(scale).all() and (scale > 0).all()):
+        raise ValueError(f"sigma_scale {values!r}: {count} positive numbers are expected")
     return scale
 
 
@@ -94,6 +103,11 @@ class Crops:
     def __len__(self) -> int:
         return len(self.pixels)
 
+    @property
+    def center_px(self) -> Array:
+        """(N, 2) middles, px of the image."""
+        return window_middles(self.window)
+
     @staticmethod
     def concatenate(parts: Sequence[Crops]) -> Crops:
         """All crops of several images, in order."""
@@ -102,7 +116,7 @@ class Crops:
 
 @dataclass(frozen=True, eq=False)
 class MultibinEstimates:
-    """Angles and sizes of N vehicles; of heads that predict more, also edges and uncertainties."""
+    """Angles and sizes of N vehicles; of heads that predict more, also outlines and uncertainties."""
 
     alpha: Array
     """(N,) heading relative to the azimuth of the ray through the crop's centre, radians in [-pi, pi); NaN: no heading."""
@@ -110,10 +124,26 @@ class MultibinEstimates:
     """(N,) log-odds of alpha against alpha + pi."""
     dims_lwh: Array
     """(N, 3) metres."""
+    center_px: Array
+    """(N, 2) middles of the crops, px: alpha is relative to the rays through them."""
     xyxy_px: Array | None = None
     """(N, 4) extents of the vehicle in the image of the crops, px."""
     sigma: Array | None = None
-    """(N, 8) standard deviations of ``UNCERTAIN``: radians, metres, px."""
+    """(N, 8 or 16) standard deviations of ``UNCERTAIN`` and of the tangents: radians, metres, px."""
+    tangents_px: Array | None = None
+    """(N, 8) reach of the vehicle in ``TANGENT_DIRECTIONS``, px of the image of the crops; None: not read."""
+
+
+    def with_rows(self, rows: NDArray[np.int64], better: MultibinEstimates) -> MultibinEstimates:
+        """These with those of ``better`` in the rows (M,)."""
+        merged: dict[str, Array | None] = {}
+        for f in fields(self):
+            own, new = getattr(self, f.name), getattr(better, f.name)
+            if own is not None:
+                own = own.copy()
+                own[rows] = new
+            merged[f.name] = own
+        return MultibinEstimates(**merged)  # type: ignore[arg-type]
 
 
 class Multibin:
@@ -125,18 +155,35 @@ class Multibin:
 
     def estimate(self, crops: Crops, cls: NDArray[np.int64]) -> MultibinEstimates:
         """Estimates for crops of vehicles of classes (N,). N may be 0."""
-        predicts = self.spec.sigma_scale is not None
+        scale = self.spec.sigma_scale
         if len(crops) == 0:
-            none = (np.zeros((0, 4)), np.zeros((0, len(UNCERTAIN)))) if predicts else (None, None)
-            return MultibinEstimates(np.zeros(0), np.zeros(0), np.zeros((0, 3)), *none)
+            nothing = MultibinEstimates(np.zeros(0), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 2)))
+            if scale is None:
+                return nothing
+            outline, sigma = np.zeros((0, len(scale) - len(UNCERTAIN) + EDGES)), np.zeros((0, len(scale)))
+            return _with_outline(nothing, outline, sigma, crops.window)
         vectors, confidence, residual, *more = self.network.run(crops.pixels)
-        estimates = decode_multibin(vectors, confidence, residual, cls, self.spec)
-        if self.spec.sigma_scale is None:
+        estimates = decode_multibin(vectors, confidence, residual, cls, crops.center_px, self.spec)
+        if scale is None:
             return estimates
-        edges, log_sigma = more
-        sigma = np.exp(log_sigma.astype(np.float64)) * self.spec.sigma_scale
-        sigma[:, _EDGES] *= crops.window[:, 2:]
-        return replace(estimates, xyxy_px=edges_in_image(edges, crops.window), sigma=sigma)
+        outline, log_sigma = more
+        return _with_outline(estimates, outline, np.exp(log_sigma.astype(np.float64)) * scale, crops.window)
+
+
+def _with_outline(
+    estimates: MultibinEstimates, outline: ArrayLike, sigma: Array, window: NDArray[np.int64]
+) -> MultibinEstimates:
+    """Estimates with the edges and tangents (N, 4 or 12) and standard deviations (N, 8 or 16) of crops at windows (N, 3)."""
+    outline = np.asarray(outline, dtype=np.float64)
+    sigma[:, OUTLINE] *= window[:, 2:]
+    tangents = tangents_in_image(outline[:, EDGES:], window) if outline.shape[1] > EDGES else None
+    return replace(estimates, xyxy_px=edges_in_image(outline[:, :EDGES], window), sigma=sigma, tangents_px=tangents)
+
+
+def window_middles(window: NDArray[np.int64]) -> Array:
+    """Middles (N, 2), px, of windows (N, 3). Pixel centres lie at integers: a window begins half a pixel before its first one."""
+    middles: Array = window[:, :2] - 0.5 + 0.5 * window[:, 2:]
+    return middles
 
 
 def edges_in_image(edges: ArrayLike, window: NDArray[np.int64]) -> Array:
@@ -147,14 +194,24 @@ def edges_in_image(edges: ArrayLike, window: NDArray[np.int64]) -> Array:
     return boxes
 
 
+def tangents_in_image(tangents: Array, window: NDArray[np.int64]) -> Array:
+    """Reaches (N, 8) in px of tangents (N, 8) given in sides of their crops' windows (N, 3) from the middle."""
+    reach: Array = window_middles(window) @ TANGENT_DIRECTIONS.T + tangents * window[:, 2:]
+    return reach
+
+
 def decode_multibin(
     vectors: NDArray[np.float32],
     confidence: NDArray[np.float32],
     residual: NDArray[np.float32],
     cls: NDArray[np.int64],
+    center_px: Array,
     spec: MultibinSpec,
 ) -> MultibinEstimates:
-    """Angles and sizes from raw outputs: bin (cos, sin) pairs (N, B, 2), bin logits (N, B), size residuals (N, 3), metres."""
+    """Angles and sizes from raw outputs: bin (cos, sin) pairs (N, B, 2), bin logits (N, B), size residuals (N, 3), metres.
+
+    center_px: (N, 2) middles of the crops.
+    """
     rows = np.arange(len(confidence))
     logits = confidence.astype(np.float64)
     best = logits.argmax(1)
@@ -168,6 +225,7 @@ def decode_multibin(
         alpha=np.where(np.hypot(cosine, sine) < _MIN_LENGTH, np.nan, alpha),
         flip_log_odds=logits[rows, best] - logits[rows, from_flip.argmin(1)],
         dims_lwh=np.maximum(spec.mean_dims_lwh[cls] + residual, 0.3),
+        center_px=center_px,
     )
 
 

@@ -25,9 +25,9 @@ from service.pipeline import Pipeline
 
 def small_recipe() -> PackRecipe:
     recipe = edge_recipe(
-        DetectorConfig(channels=(8, 8, 16, 24, 32), residuals=(0, 1, 1, 0)),
-        MultibinConfig(crop_px=32, channels=(8, 8, 16, 16)),
-        DepthConfig(stem=(8, 8, 16, 16), width=32, blocks=1, heads=2, decoder=8),
+        DetectorConfig(channels=(8, 16, 24, 32), residuals=(1, 1, 0)),
+        MultibinConfig(crop_px=32, channels=(8, 16, 16), residuals=(1, 1)),
+        DepthConfig(stem=(8, 16, 16), width=32, blocks=1, heads=2, decoder=8),
     )
     for network in recipe.networks:
         quick = replace(network.training, learning_rate=4e-3, warmup_steps=5, ema_decay=0.9, amp=False, validation_items=3)

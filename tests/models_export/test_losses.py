@@ -16,6 +16,7 @@ from models_export.losses import (
     gradient_matching_loss,
     likelihood_loss,
     multibin_loss,
+    places_loss,
     trimmed_ssi_loss,
 )
 from models_export.nets.vgg_multibin import even_bins
@@ -237,3 +238,18 @@ def test_depth_loss_adds_half_the_gradient_term() -> None:
     prediction, target = torch.rand(1, 8, 12, generator=generator), torch.rand(1, 8, 12, generator=generator)
     losses = depth_loss(prediction, target, torch.ones_like(target, dtype=torch.bool))
     assert losses["total"].item() == pytest.approx(losses["ssi"].item() + 0.5 * losses["gradient"].item(), abs=1e-6)
+
+
+def test_the_places_of_an_exact_reading_cost_least_and_have_its_mean() -> None:
+    places = torch.linspace(-0.9, 0.9, 10)
+    target = torch.tensor([[0.04, -0.9, 0.9, 3.0]])
+    share = (0.04 + 0.1) / 0.2
+    exact = torch.full((1, 4, 10), -50.0)
+    exact[0, 0, 4], exact[0, 0, 5] = math.log(1 - share), math.log(share)
+    exact[0, 1, 0] = exact[0, 2, 9] = exact[0, 3, 9] = 0.0
+    mean = (exact.softmax(-1) * places).sum(-1)
+    assert torch.allclose(mean, torch.tensor([[0.04, -0.9, 0.9, 0.9]]), atol=1e-5)
+    least = places_loss(exact, target, places)
+    entropy = -(share * math.log(share) + (1 - share) * math.log(1 - share))
+    assert torch.allclose(least, torch.tensor([[entropy, 0.0, 0.0, 0.0]]), atol=1e-4)
+    assert (places_loss(torch.zeros(1, 4, 10), target, places) > least).all()

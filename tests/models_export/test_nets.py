@@ -8,11 +8,12 @@ import torch
 from models_export.nets.blocks import parameter_count
 from models_export.nets.depth import DepthConfig, EdgeDepth
 from models_export.nets.detector import DetectorConfig, EdgeDetector
-from models_export.nets.multibin import EdgeMultibin, MultibinConfig
+from models_export.nets.multibin import OUTLINE_REACH, EdgeMultibin, MultibinConfig
 from models_export.train.detector import assign, decode, detector_loss
 from service.nets.decoding import decode_heads
 from service.nets.detector_spec import DetectorSpec
 from service.nets.error_model import ErrorModel
+from service.geometry.boxes import TANGENT_DEGREES
 from service.nets.multibin import UNCERTAIN
 
 CONFIG = DetectorConfig(classes=("car",))
@@ -34,18 +35,21 @@ def test_an_untrained_detector_is_quiet() -> None:
 
 def test_multibin_vectors_have_length_one() -> None:
     crops = torch.randint(0, 255, (5, 96, 96, 3), dtype=torch.uint8)
-    vectors, confidence, residual, edges, log_sigma = EdgeMultibin(MultibinConfig()).eval()(crops)
-    assert torch.allclose(vectors.norm(dim=-1), torch.ones(5, 2), atol=1e-4)
-    assert confidence.shape == (5, 2)
+    config = MultibinConfig()
+    vectors, confidence, residual, outline, log_sigma = EdgeMultibin(config).eval()(crops)
+    bins = len(config.bin_centers_rad)
+    assert torch.allclose(vectors.norm(dim=-1), torch.ones(5, bins), atol=1e-4)
+    assert confidence.shape == (5, bins)
     assert residual.shape == (5, 3)
-    assert edges.shape == (5, 4)
-    assert log_sigma.shape == (5, len(UNCERTAIN))
+    assert outline.shape == (5, 4 + len(TANGENT_DEGREES))
+    assert outline.abs().max() < OUTLINE_REACH
+    assert log_sigma.shape == (5, len(UNCERTAIN) + len(TANGENT_DEGREES))
 
 
-def test_depth_gives_an_eighth_of_any_canvas() -> None:
+def test_depth_gives_a_sixteenth_of_any_canvas() -> None:
     net = EdgeDepth(DepthConfig()).eval()
-    assert net(torch.zeros(1, 96, 160, 3, dtype=torch.uint8)).shape == (1, 12, 20)
-    assert net(torch.zeros(2, 64, 96, 3, dtype=torch.uint8)).shape == (2, 8, 12)
+    assert net(torch.zeros(1, 96, 160, 3, dtype=torch.uint8)).shape == (1, 6, 10)
+    assert net(torch.zeros(2, 64, 96, 3, dtype=torch.uint8)).shape == (2, 4, 6)
 
 
 def test_folding_the_pooling_changes_no_output() -> None:
@@ -59,7 +63,7 @@ def test_folding_the_pooling_changes_no_output() -> None:
 
 def test_networks_are_small() -> None:
     assert parameter_count(EdgeDetector(CONFIG)) < 2e6
-    assert parameter_count(EdgeMultibin(MultibinConfig())) < 2e6
+    assert parameter_count(EdgeMultibin(MultibinConfig())) < 4e6
     assert parameter_count(EdgeDepth(DepthConfig())) < 3e6
 
 

@@ -27,9 +27,9 @@ from models_export.train.validation import Validation
 from service.errors import InputError
 
 SHORT = TrainConfig(steps=60, batch_size=4, learning_rate=3e-3, warmup_steps=5, ema_decay=0.9, amp=False, checkpoint_every=20)
-SMALL_DETECTOR = DetectorConfig(channels=(8, 8, 16, 24, 32), residuals=(0, 1, 1, 0))
-SMALL_DEPTH = DepthConfig(stem=(8, 8, 16, 16), width=32, blocks=1, heads=2, decoder=8)
-SMALL_HEAD = MultibinConfig(crop_px=32, channels=(8, 8, 16, 16), squeezed=16, dropout=0.1)
+SMALL_DETECTOR = DetectorConfig(channels=(8, 16, 24, 32), residuals=(1, 1, 0))
+SMALL_DEPTH = DepthConfig(stem=(8, 16, 16), width=32, blocks=1, heads=2, decoder=8)
+SMALL_HEAD = MultibinConfig(crop_px=32, channels=(8, 16, 16), residuals=(1, 1), squeezed=16, dropout=0.1)
 
 
 def task_of(name: str, samples: list[Sample]) -> DetectorTask | MultibinTask | DepthTask:
@@ -183,7 +183,7 @@ def test_autocast_changes_the_arithmetic_only_where_asked(toy_samples: list[Samp
 def test_weights_learn_at_the_pace_of_their_group(toy_samples: list[Sample], tmp_path: Path) -> None:
     task = task_of("depth", toy_samples)
     before = deepcopy(task.net.state_dict())
-    task.parameter_groups = lambda net: decayed_groups(net.stem4, rate=0.0) + decayed_groups(net.head)  # type: ignore[method-assign]
+    task.parameter_groups = lambda net: decayed_groups(net.stem8, rate=0.0) + decayed_groups(net.head)  # type: ignore[method-assign]
     fit(task, replace(SHORT, steps=2), tmp_path)
     after = task.net.state_dict()
     moved = {

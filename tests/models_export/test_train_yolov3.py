@@ -64,6 +64,7 @@ def frames() -> list[Sample]:
                     source="simulated",
                     dims_lwh=truth[step].dims_lwh[seen],
                     alpha=np.zeros(count),
+                    corners_px=np.zeros((count, 8, 2)),
                     visible=visible[seen],
                     truncated=np.zeros(count),
                     center=truth[step].center[seen],

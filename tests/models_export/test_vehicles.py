@@ -8,13 +8,20 @@ from hypothesis import strategies as st
 
 from models_export.data.detection import VehicleSample
 from models_export.data.vehicles import Vehicle, vehicles_of
-from models_export.train.multibin import MAX_JITTER, jittered
+from models_export.train.multibin import MAX_JITTER, jittered, mirrored_outline
+from service.geometry.boxes import tangents_of
 from service.geometry.camera import Camera, ray_azimuth
-from service.geometry.transforms import pole_camera_pose, wrap_angle
-from service.nets.multibin import crop_windows, edges_in_image
+from service.geometry.transforms import Array, pole_camera_pose, wrap_angle
+from service.nets.multibin import crop_windows, edges_in_image, tangents_in_image
 
 K = np.array([[300.0, 0.0, 199.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera("north", 400, 240, K, pole_camera_pose([0.0, 0.0, 6.0], 0.0, 0.3))
+
+
+def outline_of(xyxy: list[float]) -> Array:
+    """Corners (1, 8, 2) of a box whose outline is a rectangle."""
+    x0, y0, x1, y1 = xyxy
+    return np.array([[[x0, y0], [x1, y0], [x1, y1], [x0, y1]] * 2])
 
 
 def white_box(xyxy: list[int]) -> Vehicle:
@@ -35,6 +42,7 @@ def white_box(xyxy: list[int]) -> Vehicle:
             camera=CAMERA,
             dims_lwh=np.array([[4.0, 1.8, 1.5]]),
             alpha=np.array([0.4]),
+            corners_px=outline_of([x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5]),
         )
     )
     return vehicle
@@ -45,10 +53,20 @@ def test_the_edges_are_where_the_crop_shows_them(seed: int) -> None:
     rng = np.random.default_rng(seed)
     x0, y0 = rng.integers(60, 200), rng.integers(60, 120)
     vehicle = white_box([x0, y0, x0 + rng.integers(30, 120), y0 + rng.integers(25, 60)])
-    crop, _, edges = vehicle.crop(jittered(vehicle.xyxy_px, rng), 96)
+    crop, _, outline = vehicle.crop(jittered(vehicle.xyxy_px, rng), 96)
     white = np.argwhere(crop[..., 0] > 127)
     shown = np.array([*(white.min(0)[::-1] - 0.5), *(white.max(0)[::-1] + 0.5)])
-    np.testing.assert_allclose(np.clip((edges + 0.5) * 96 - 0.5, -0.5, 95.5), shown, atol=1.1)
+    np.testing.assert_allclose(np.clip((outline[:4] + 0.5) * 96 - 0.5, -0.5, 95.5), shown, atol=1.1)
+    corners = outline_of(((outline[:4] + 0.5) * 96 - 0.5).tolist())[0] - 47.5
+    np.testing.assert_allclose(outline[4:] * 96, tangents_of(corners), atol=1.1)
+
+
+@given(seed=st.integers(0, 10_000))
+def test_a_mirrored_outline_is_the_outline_in_the_mirror(seed: int) -> None:
+    points = np.random.default_rng(seed).uniform(-0.5, 0.5, (8, 2))
+    mirrored = points * [-1.0, 1.0]
+    outline, expected = (np.concatenate([p.min(0), p.max(0), tangents_of(p)]) for p in (points, mirrored))
+    np.testing.assert_allclose(mirrored_outline(outline), expected, atol=1e-12)
 
 
 def test_alpha_follows_the_ray_through_the_crop() -> None:
@@ -62,9 +80,11 @@ def test_alpha_follows_the_ray_through_the_crop() -> None:
 
 def test_a_large_vehicle_is_kept_small_and_its_edges_agree_with_the_service() -> None:
     vehicle = white_box([20, 20, 380, 200])
-    assert max(vehicle.patch.shape) <= 176
-    _, _, edges = vehicle.crop(vehicle.xyxy_px, 96)
-    np.testing.assert_allclose(edges_in_image([edges], crop_windows([vehicle.xyxy_px]))[0], vehicle.xyxy_px, atol=4.0)
+    assert max(vehicle.patch.shape) <= 224
+    _, _, outline = vehicle.crop(vehicle.xyxy_px, 96)
+    windows = crop_windows([vehicle.xyxy_px])
+    np.testing.assert_allclose(edges_in_image([outline[:4]], windows)[0], vehicle.xyxy_px, atol=4.0)
+    np.testing.assert_allclose(tangents_in_image(outline[None, 4:], windows)[0], vehicle.tangents_px, atol=4.0)
 
 
 @given(seed=st.integers(0, 1000))

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.association import best_of_duplicates, gated_assignment, mahalanobis_cost
-from service.fusion import FusionSettings, fuse
+from service.fusion import FusionSettings, footprint_doubt, fuse
 from service.geometry.boxes import Boxes, box_states, project_extents
 from service.geometry.camera import Camera
 from service.geometry.ground import GroundPlane
@@ -209,6 +209,24 @@ def test_overlapping_vehicles_become_one_though_the_gate_kept_them_apart():
         len(fuse(boxes, np.array([0, 3]), four_cameras(), replace(strict, duplicate_iou=1.0, duplicate_distance_m=0.0)).boxes)
         == 2
     )
+
+
+def test_doubt_about_the_footprint_lowers_the_score_and_the_rank():
+    sure, vague = car(20.0, 0.0), car(-20.0, 0.0)
+    boxes = some_boxes([sure, vague])
+    covariance = boxes.covariance.copy()
+    covariance[1, :2, :2] *= 16.0
+    boxes = replace(boxes, covariance=covariance, score=np.array([0.7, 0.8]))
+    plain = fuse(boxes, np.zeros(2, np.int64), four_cameras()[:1])
+    doubted = fuse(boxes, np.zeros(2, np.int64), four_cameras()[:1], FusionSettings(doubt=2.0))
+    assert plain.boxes.center[0, 0] < 0 < doubted.boxes.center[0, 0]
+    expected = plain.boxes.score[::-1] * np.exp(-2.0 * footprint_doubt(doubted.boxes))
+    np.testing.assert_allclose(doubted.boxes.score, expected)
+    # A standard deviation of a tenth of the length and a fifth of the width, whichever way the car points.
+    turned = replace(doubted.boxes, yaw=np.array([0.3, 2.0]), dims_lwh=np.array([[4.0, 2.0, 1.5]] * 2))
+    axes = np.array([[[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]] for a in turned.yaw])
+    turned.covariance[:, :2, :2] = axes.transpose(0, 2, 1) @ np.diag([0.16, 0.16]) @ axes
+    np.testing.assert_allclose(footprint_doubt(turned), 0.3)
 
 
 def test_what_others_should_see_and_do_not_is_less_certain():

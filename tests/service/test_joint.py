@@ -14,7 +14,7 @@ from service.geometry.ground import GroundPlane
 from service.geometry.transforms import invert_rigid, pole_camera_pose, rigid, rotation_z, wrap_angle
 from service.joint import shared_covariance, solve_jointly
 from service.lifting import LiftSettings, Measurements, lift_with_terms
-from service.residuals import normal_equations, residuals
+from service.residuals import FIXED_ROWS, normal_equations, residuals
 from service.solver import SolverSettings, covariance_of
 
 K = np.array([[642.0, 0.0, 641.5], [0.0, 642.0, 191.5], [0.0, 0.0, 1.0]])
@@ -133,9 +133,9 @@ def test_a_shifted_picture_counts_as_correlated_edges():
     residual, jacobian = residuals(loose, states)
     equations = normal_equations(loose, states)
     for row in range(10):
-        noise = np.eye(6)
-        moved = np.zeros((6, 2))
-        moved[[0, 2], 0], moved[[1, 3], 1] = terms.edge_weight[row, [0, 2]], terms.edge_weight[row, [1, 3]]
+        noise = np.eye(FIXED_ROWS)
+        moved = np.zeros((FIXED_ROWS, 2))
+        moved[[2, 4], 0], moved[[3, 5], 1] = terms.edge_weight[row, [0, 2]], terms.edge_weight[row, [1, 3]]
         information = np.linalg.inv(noise + shift[row] ** 2 * moved @ moved.T)
         hessian = jacobian[row].T @ information @ jacobian[row] + np.diag(terms.prior_weight[row] ** 2)
         np.testing.assert_allclose(equations.hessian[row], hessian, rtol=1e-6, atol=1e-6)

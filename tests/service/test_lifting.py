@@ -6,13 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from service.geometry.boxes import box_states, project_extents
+from service.geometry.boxes import TANGENT_DIRECTIONS, box_corners, box_states, project_extents, tangents_of
 from service.geometry.camera import Camera
 from service.geometry.ground import GroundPlane
 from service.geometry.iou import iou_3d
-from service.geometry.transforms import invert_rigid, pole_camera_pose, rigid, rotation_z, wrap_angle
+from service.geometry.transforms import invert_rigid, pole_camera_pose, rigid, rotation_z, transform_points, wrap_angle
 from service.lifting import LiftSettings, Measurements, lift
-from service.residuals import ROWS, BoxProblem, normal_equations, residuals
+from service.residuals import FIXED_ROWS, BoxProblem, normal_equations, residuals
 from service.solver import SolverSettings
 
 K = np.array([[642.0, 0.0, 641.5], [0.0, 642.0, 191.5], [0.0, 0.0, 1.0]])
@@ -107,6 +107,40 @@ def test_the_documented_table_map_and_ground():
     assert np.median(errors_m(blind, truth)) > 1.8 * np.median(error)
 
 
+def with_tangents(camera, measurements, truth, sigma_px=2.0, rng=None):
+    """The measurements with tangents of the true boxes, exact or noisy."""
+    corners = transform_points(camera.T_cam_world, box_corners(truth[:, :3], truth[:, 3:6], truth[:, 6]))
+    tangents = tangents_of(camera.project_cam(corners))
+    noise = 0.0 if rng is None else sigma_px * rng.normal(size=tangents.shape)
+    return replace(measurements, tangents_px=tangents + noise, sigma_tangents_px=np.full(tangents.shape, sigma_px))
+
+
+@pytest.mark.parametrize("lens", [(), (-0.1, 0.01, 0.0, 0.0, 0.0), (-0.25, 0.06, 0.001, -0.001, 0.0)])
+def test_tangents_tell_the_size_and_heading_that_nobody_knew(lens):
+    """One camera, an outline and the road: edges alone leave length and width open."""
+    camera = pole_camera(lens=lens)
+    truth, xyxy = vehicles(camera, 200, np.random.default_rng(9))
+    vague = replace(measured(truth, xyxy), dims_lwh=np.tile([4.3, 1.8, 1.55], (200, 1)), sigma_dims=np.full((200, 3), 1.0))
+    turned = replace(vague, yaw=wrap_angle(truth[:, 6] + 0.1), sigma_yaw=np.full(200, 0.3))
+    fine = replace(turned, sigma_px=np.full((200, 4), 0.25))
+    known = box_states(lift([camera], GroundPlane(), with_tangents(camera, fine, truth, 0.25), CONVERGED))
+    unknown = box_states(lift([camera], GroundPlane(), fine, CONVERGED))
+    error, error_without = np.abs(known[:, 3:5] - truth[:, 3:5]), np.abs(unknown[:, 3:5] - truth[:, 3:5])
+    assert np.median(error) < 0.02
+    assert np.median(error) < 0.2 * np.median(error_without)
+    assert np.median(np.abs(wrap_angle(known[:, 6] - truth[:, 6]))) < 0.01
+
+
+def test_the_covariance_is_honest_with_tangents_too():
+    camera, rng = pole_camera(), np.random.default_rng(5)
+    truth, xyxy = vehicles(camera, 1000, rng, ground_sigma=0.05)
+    noisy = with_tangents(camera, measured(truth, xyxy, rng), truth, 2.0, rng)
+    boxes = lift([camera], GroundPlane(), noisy, FLAT_GROUND)
+    error = boxes.center - truth[:, :3]
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(boxes.covariance[:, :3, :3]), error)
+    assert 2.6 < nees.mean() < 3.4
+
+
 @pytest.mark.parametrize(("height", "pitch"), [(5.0, 10.0), (7.0, 20.0)])
 def test_the_covariance_is_honest(height, pitch):
     """The normalised squared error of 3 degrees of freedom has mean 3 when the sigmas are true."""
@@ -159,6 +193,9 @@ def some_problem(rng, n, hinged):
         edges=rng.normal(size=(n, 4)),
         edge_weight=rng.uniform(50, 300, (n, 4)),
         hinged=np.full((n, 4), hinged),
+        tangents=rng.normal(size=(n, 8)),
+        tangent_weight=rng.uniform(50, 300, (n, 8)),
+        directions=np.tile(TANGENT_DIRECTIONS, (n, 1, 1)),
         prior=rng.normal(size=(n, 7)),
         prior_weight=rng.uniform(0.1, 9, (n, 7)),
         ground=GroundPlane(np.array([0.1, -0.2, np.sqrt(0.95)]), 0.7),
@@ -166,7 +203,7 @@ def some_problem(rng, n, hinged):
         ray=rng.normal(size=(n, 3)),
         depth=rng.uniform(5, 30, n),
         depth_weight=rng.uniform(0.5, 2, n),
-        huber=np.full((n, ROWS), np.inf),
+        huber=np.full((n, FIXED_ROWS + 8), np.inf),
     )
 
 
@@ -188,7 +225,7 @@ def test_analytic_jacobian_is_the_derivative(hinged):
 
 def test_gradient_is_that_of_the_robust_cost():
     rng = np.random.default_rng(6)
-    problem = replace(some_problem(rng, 50, False), huber=np.full((50, ROWS), 2.0))
+    problem = replace(some_problem(rng, 50, False), huber=np.full((50, FIXED_ROWS + 8), 2.0))
     state = np.c_[rng.normal(size=(50, 3)), rng.uniform(1, 4, (50, 3)), rng.uniform(-3, 3, 50)]
     gradient = normal_equations(problem, state).gradient
     numeric = derivative(lambda x: normal_equations(problem, x).cost, state)

@@ -6,15 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from service.depth_scale import DepthReadings
 from service.geometry.camera import Camera, yaw_from_alpha
 from service.geometry.transforms import Array, pole_camera_pose
-from service.measuring import Still, cut_detected, measure
+from service.measuring import Still, cut_detected, measure, refined
 from service.nets.detections import Detections
 from service.nets.detector_spec import DetectorSpec
 from service.nets.error_model import ErrorModel
-from service.nets.multibin import UNCERTAIN, MultibinEstimates, MultibinSpec
+from service.nets.multibin import UNCERTAIN, Crops, MultibinEstimates, MultibinSpec, crop_windows
 
 K = np.array([[600.0, 0.0, 319.5], [0.0, 600.0, 179.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera("north", 640, 360, K, pole_camera_pose([0.0, 0.0, 6.0], 0.3, 0.3))
@@ -24,6 +25,10 @@ HEAD = MultibinSpec(
 )
 INNER, CUT = [100.0, 60.0, 160.0, 100.0], [-3.0, 60.0, 40.0, 100.0]
 SURE = np.array([[0.02, 0.1, 0.05, 0.04, 1.5, 1.6, 1.7, 1.8]])
+
+
+MIDDLE = [260.5, 160.5]
+"""Of ``INNER``, in px of the large picture."""
 
 
 def still(factor: int = 2) -> Still:
@@ -37,7 +42,8 @@ def found(box: list[float]) -> Detections:
 
 def says(xyxy_px: Array | None = None, alpha: float = 0.4) -> MultibinEstimates:
     sigma = None if xyxy_px is None else SURE
-    return MultibinEstimates(np.array([alpha]), np.ones(1), np.array([[4.5, 1.8, 1.5]]), xyxy_px, sigma)
+    size, middle = np.array([[4.5, 1.8, 1.5]]), np.array([MIDDLE])
+    return MultibinEstimates(np.array([alpha]), np.ones(1), size, middle, xyxy_px, sigma)
 
 
 def measured(box: list[float], estimates: MultibinEstimates, factor: int = 2):  # type: ignore[no-untyped-def]
@@ -78,9 +84,9 @@ def test_cut_vehicles_are_read_worse() -> None:
 
 
 @pytest.mark.parametrize("alpha", [-2.0, 0.4])
-def test_yaw_is_about_the_ray_through_the_detected_box(alpha: float) -> None:
+def test_yaw_is_about_the_ray_through_the_crop(alpha: float) -> None:
     told = measured(INNER, says(np.array([[150.0, 121.0, 322.0, 199.0]]), alpha))
-    assert told.yaw[0] == pytest.approx(float(yaw_from_alpha(CAMERA, [alpha], [[260.5, 160.5]])[0]))
+    assert told.yaw[0] == pytest.approx(float(yaw_from_alpha(CAMERA, [alpha], [MIDDLE])[0]))
 
 
 def test_a_heading_that_is_no_number_may_be_any() -> None:
@@ -100,6 +106,32 @@ def test_cameras_keep_their_order_and_none_may_be_empty_handed() -> None:
 
 def test_crops_are_cut_from_the_large_picture() -> None:
     one = still()
-    window = cut_detected([one], [found(INNER)], 144).window[0]
-    np.testing.assert_array_equal(window, [188, 88, 144])
-    np.testing.assert_array_equal(cut_detected([one], [found(INNER)], 144).pixels[0], one.image[88:232, 188:332])
+    window = cut_detected([one], [found(INNER)], 156).window[0]
+    np.testing.assert_array_equal(window, [182, 82, 156])
+    np.testing.assert_array_equal(cut_detected([one], [found(INNER)], 156).pixels[0], one.image[82:238, 182:338])
+
+
+class _Recorder:
+    """A head that says the same of every crop, and remembers the windows."""
+
+    spec = HEAD
+
+    def __init__(self) -> None:
+        self.windows: list[list[int]] = []
+
+    def estimate(self, crops: Crops, cls: NDArray[np.int64]) -> MultibinEstimates:
+        assert len(crops) == len(cls)
+        self.windows += crops.window.tolist()
+        return says(np.tile([[210.0, 130.0, 330.0, 210.0]], (len(crops), 1)), alpha=1.0)
+
+
+@pytest.mark.parametrize(("shift", "read_again"), [(2.0, False), (12.0, True), (100.0, False)])
+def test_a_vehicle_is_read_again_around_its_own_outline(shift: float, read_again: bool) -> None:
+    head, first = _Recorder(), says(np.array([[200.5, 120.5, 320.5 + shift, 200.5]]))
+    second = refined([still()], [found(INNER)], first, head, 0.05)  # type: ignore[arg-type]
+    assert bool(head.windows) == read_again
+    if read_again:
+        assert head.windows == crop_windows(first.xyxy_px).tolist()
+        assert second.alpha[0] == 1.0
+    else:
+        assert second is first

@@ -16,7 +16,7 @@ from service.frames import EncodedFrame, FrameSet
 from service.nets.multibin import MultibinEstimates
 from service.nets.pack import load_pack
 from service.pipeline import Pipeline, PipelineSettings, SetResult
-from service.site import parse_site
+from service.site import AccuracyModel, parse_site
 
 CLIP = Path(__file__).resolve().parents[2] / "clients" / "clip"
 STEPS = ("decode", "detect", "orient", "depth", "lift", "fuse", "total")
@@ -60,6 +60,13 @@ def test_one_set_gives_one_answer(pipeline: Pipeline) -> None:
     # Fitted scales of the depth map are kept a camera, so each run gets a site, and cameras, of its own.
     first, second = pipeline.run(frame_set(10)), pipeline.run(frame_set(10))
     np.testing.assert_array_equal(first.boxes.center, second.boxes.center)
+
+
+def test_a_site_that_is_surveyed_better_gives_surer_boxes(pipeline: Pipeline) -> None:
+    surveyed = frame_set(30)
+    vague = replace(surveyed, site=replace(surveyed.site, accuracy=AccuracyModel(ground_m=0.3, camera_m=0.3, camera_rad=0.02)))
+    exact, loose = (np.median(pipeline.run(s).boxes.covariance[:, 0, 0]) for s in (surveyed, vague))
+    assert exact < 0.7 * loose
 
 
 def test_a_lost_camera_leaves_the_others(pipeline: Pipeline) -> None:

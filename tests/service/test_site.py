@@ -27,6 +27,7 @@ def document():
         "id": "crossing",
         "origin": {"lat": 48.1, "lon": 11.6, "alt": 500.0},
         "ground": {"normal": [0.0, 0.0, 1.0], "offset": 0.25},
+        "accuracy": {"ground_m": 0.02, "ground_per_m": 0.0, "camera_m": 0.03, "camera_rad": 0.001},
         "cameras": [camera_document("north"), camera_document("east", (20.0, 0.0, 7.0))],
     }
 
@@ -146,6 +147,8 @@ SCALED = np.diag([2.0, 2.0, 2.0, 1.0]).tolist()
         ("ground.normal", [0.0, 0.0, 0.0], "ground.normal"),
         ("ground.normal", [1.0, 0.0, 0.0], "ground.normal"),
         ("origin.lat", 91.0, "origin.lat"),
+        ("accuracy.ground_m", 0.0, "accuracy.ground_m"),
+        ("accuracy.camera_rad", float("nan"), "accuracy.camera_rad"),
         ("colour", "red", "colour"),
     ],
 )

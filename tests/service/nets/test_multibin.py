@@ -10,12 +10,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.errors import PackError
+from service.geometry.boxes import TANGENT_DEGREES, TANGENT_DIRECTIONS, tangents_of
 from service.nets.error_model import ErrorModel
-from service.nets.multibin import UNCERTAIN, MultibinSpec, crop_vehicles, crop_windows, decode_multibin, edges_in_image
+from service.nets.multibin import (
+    UNCERTAIN,
+    MultibinSpec,
+    crop_vehicles,
+    crop_windows,
+    decode_multibin,
+    edges_in_image,
+    tangents_in_image,
+    window_middles,
+)
 
 SPEC = MultibinSpec(
     64, np.array([0.0, np.pi]), np.array([[4.4, 1.8, 1.5]]), (ErrorModel(0.2, 0, 0, 1),) * 3, ErrorModel(0.07, 0, 0, 1)
 )
+
+ONE = np.zeros((1, 2))
 
 
 @given(alpha=st.floats(-np.pi, np.pi - 1e-6), certainty=st.floats(0.1, 9.0))
@@ -24,7 +36,7 @@ def test_decoding_inverts_encoding(alpha: float, certainty: float) -> None:
     vectors = np.stack([np.cos(delta), np.sin(delta)], -1)[None].astype(np.float32)
     nearest = np.abs((delta + np.pi) % (2 * np.pi) - np.pi).argmin()
     confidence = np.where(np.arange(2) == nearest, certainty, 0.0)[None].astype(np.float32)
-    estimate = decode_multibin(vectors, confidence, np.array([[0.1, 0.0, -0.1]], np.float32), np.zeros(1, np.int64), SPEC)
+    estimate = decode_multibin(vectors, confidence, np.array([[0.1, 0.0, -0.1]], np.float32), np.zeros(1, np.int64), ONE, SPEC)
     assert np.cos(estimate.alpha[0] - alpha) == pytest.approx(1.0, abs=1e-6)
     assert -np.pi <= estimate.alpha[0] < np.pi
     assert estimate.flip_log_odds[0] == pytest.approx(certainty, rel=1e-5)
@@ -37,7 +49,7 @@ def test_of_many_bins_the_opposite_one_answers_for_the_flip() -> None:
     delta = alpha - spec.bin_centers_rad
     vectors = np.stack([np.cos(delta), np.sin(delta)], -1)[None].astype(np.float32)
     confidence = np.array([[5.0, 4.5, -3.0, 1.0]], np.float32)
-    estimate = decode_multibin(vectors, confidence, np.zeros((1, 3), np.float32), np.zeros(1, np.int64), spec)
+    estimate = decode_multibin(vectors, confidence, np.zeros((1, 3), np.float32), np.zeros(1, np.int64), ONE, spec)
     assert estimate.alpha[0] == pytest.approx(alpha, abs=1e-6)
     assert estimate.flip_log_odds[0] == pytest.approx(8.0)
 
@@ -45,7 +57,7 @@ def test_of_many_bins_the_opposite_one_answers_for_the_flip() -> None:
 def test_a_vector_without_length_is_no_heading() -> None:
     vectors = np.array([[[0, 0], [1, 0]], [[1, 0], [0, 0]], [[0.6, 0.8], [0, 0]]], np.float32)
     confidence = np.array([[2, 1]] * 3, np.float32)
-    estimate = decode_multibin(vectors, confidence, np.zeros((3, 3), np.float32), np.zeros(3, np.int64), SPEC)
+    estimate = decode_multibin(vectors, confidence, np.zeros((3, 3), np.float32), np.zeros(3, np.int64), np.zeros((3, 2)), SPEC)
     assert np.isnan(estimate.alpha).tolist() == [True, False, False]
 
 
@@ -75,7 +87,7 @@ def test_no_boxes_give_no_crops() -> None:
 def test_a_window_is_square_around_its_box_with_a_margin(x: float, y: float, width: float, height: float) -> None:
     left, top, side = crop_windows([[x, y, x + width, y + height]])[0]
     assert side >= max(width, height)
-    assert side == max(round(1.2 * max(width, height)), 4)
+    assert side == max(round(1.3 * max(width, height)), 4)
     assert abs(left + side / 2 - (x + width / 2)) <= 0.5
     assert abs(top + side / 2 - (y + height / 2)) <= 0.5
 
@@ -102,7 +114,7 @@ def test_a_head_without_predicted_sigmas_is_weighed_by_its_scores() -> None:
     spec = MultibinSpec.from_metadata(metadata())
     assert spec.sigma_scale is None
     estimates = decode_multibin(
-        np.zeros((2, 2, 2), "f4"), np.zeros((2, 2), "f4"), np.zeros((2, 3), "f4"), np.zeros(2, int), spec
+        np.zeros((2, 2, 2), "f4"), np.zeros((2, 2), "f4"), np.zeros((2, 3), "f4"), np.zeros(2, int), np.zeros((2, 2)), spec
     )
     alpha, dims = spec.sigmas(estimates, np.ones(2), np.zeros(2, dtype=bool))
     assert (alpha.shape, dims.shape) == ((2,), (2, 3))
@@ -114,3 +126,19 @@ def test_scales_that_are_none_are_refused(scale: object) -> None:
     assert MultibinSpec.from_metadata(metadata(sigma_scale=[1.0] * len(UNCERTAIN))).sigma_scale is not None
     with pytest.raises(PackError, match="incomplete"):
         MultibinSpec.from_metadata(metadata(sigma_scale=scale))
+
+
+def test_tangents_want_scales_of_their_own_and_known_directions() -> None:
+    spec = MultibinSpec.from_metadata(metadata(sigma_scale=[1.0] * 16, tangents_deg=list(TANGENT_DEGREES)))
+    assert spec.sigma_scale is not None
+    assert spec.sigma_scale.shape == (16,)
+    for wrong in ({"sigma_scale": [1.0] * 8, "tangents_deg": list(TANGENT_DEGREES)}, {"tangents_deg": [10, 20]}):
+        with pytest.raises(PackError, match="incomplete"):
+            MultibinSpec.from_metadata(metadata(**wrong))
+
+
+def test_tangents_of_a_crop_are_the_images() -> None:
+    points = np.array([[120.0, 80.0], [180.0, 95.0], [150.0, 130.0]])
+    window = crop_windows([[118.0, 78.0, 190.0, 140.0]])
+    told = (tangents_of(points) - TANGENT_DIRECTIONS @ window_middles(window)[0]) / window[0, 2]
+    np.testing.assert_allclose(tangents_in_image(told[None], window)[0], tangents_of(points))
