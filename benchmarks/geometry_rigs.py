@@ -16,7 +16,8 @@ from service.geometry.boxes import Boxes, project_extents
 from service.geometry.camera import Camera
 from service.geometry.ground import GroundPlane
 from service.geometry.transforms import Array, pole_camera_pose, rigid, rotation_z
-from service.lifting import LiftSettings, Measurements
+from service.lifting import LiftSettings
+from service.measurements import Measurements
 from service.residuals import BoxProblem
 
 K = np.array([[642.0, 0.0, 641.5], [0.0, 642.0, 191.5], [0.0, 0.0, 1.0]])

@@ -17,7 +17,8 @@ from service.fusion import FusionSettings, fuse
 from service.geometry.boxes import Boxes
 from service.geometry.ground import Ground, fit_grid, fit_plane
 from service.geometry.transforms import Array
-from service.lifting import LiftSettings, Measurements
+from service.lifting import LiftSettings
+from service.measurements import Measurements
 from service.residuals import BoxProblem
 
 PIXEL_SIGMA = 2.0

@@ -13,7 +13,8 @@ from service.geometry.camera import Camera
 from service.geometry.ground import Ground
 from service.geometry.iou import clip_convex_pairs, rectangle_corners
 from service.geometry.transforms import Array, wrap_angle
-from service.lifting import LiftSettings, Measurements, lift, lift_with_terms
+from service.lifting import LiftSettings, lift, lift_with_terms
+from service.measurements import Measurements
 from service.paper_lifting import lift_paper
 from service.residuals import BoxProblem
 

@@ -16,7 +16,8 @@ from service.geometry.boxes import clip_extents, project_extents
 from service.geometry.camera import Camera
 from service.geometry.ground import GroundPlane
 from service.geometry.transforms import Array, pole_camera_pose
-from service.lifting import Measurements, lift_with_terms
+from service.lifting import lift_with_terms
+from service.measurements import Measurements
 from service.tracking import Tracker
 
 BOXES = (1, 4, 16, 64, 128, 256, 512)

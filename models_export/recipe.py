@@ -130,7 +130,9 @@ def train(
     task = network.task([*training, *added], network.config)
     if init is not None and not resume:
         network.load_pretrained(task.net, init)
-    config = replace(network.training, init=None if init is None else init.name, recordings=real.credits() if real and added else ())
+    config = replace(
+        network.training, init=None if init is None else init.name, recordings=real.credits() if real and added else ()
+    )
     return fit(task, config, out, task.held_out([*held_out, *checked]), resume=resume)
 
 

@@ -164,8 +164,8 @@ def edge_errors(matches: Sequence[Matched]) -> ErrorModel:
 def multibin_scores(multibin: Multibin, matches: Sequence[Matched]) -> dict[str, Any]:
     """Errors of angle and size on detected boxes: medians, flips, and the error models that lifting uses.
 
-    Of a head that predicts an outline and standard deviations, also the outline' errors and ``sigma_scale``: what makes the predicted
-    deviations cover 68 % of the errors. Raises TooFewVehiclesError.
+    Of a head that predicts an outline and standard deviations, also the outline's errors and ``sigma_scale``: what makes the
+    predicted deviations cover 68 % of the errors. Raises TooFewVehiclesError.
     """
     rows = [_head_errors(multibin, m) for m in matches if len(m.truth)]
     if not rows:
@@ -198,8 +198,8 @@ class _HeadErrors:
     """What the head says of M matched detections, less the truth."""
 
     error: Array
-    """(M, 8 or 16) in the order of ``UNCERTAIN`` and the tangents: radians (flips aside), metres, px; NaN for edges that are cut,
-    or not read."""
+    """(M, 8 or 16) in the order of ``UNCERTAIN`` and the tangents: radians (flips aside), metres, px; NaN for edges that are
+    cut, or not read."""
     sigma: Array
     """(M, 8 or 16) predicted standard deviations; ones where the head predicts none."""
     flipped: NDArray[np.bool_]

@@ -13,7 +13,7 @@ from service.depth_scale import DepthReadings
 from service.geometry.boxes import clip_extents, cut_edges
 from service.geometry.camera import Camera, UInt8Image, yaw_from_alpha
 from service.geometry.transforms import Array
-from service.lifting import Measurements
+from service.measurements import Measurements
 from service.nets.detections import Detections
 from service.nets.detector import edge_sigma
 from service.nets.detector_spec import DetectorSpec

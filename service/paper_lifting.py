@@ -18,7 +18,8 @@ from service.geometry.boxes import CORNER_SIGNS, STATE_DIM, Boxes
 from service.geometry.camera import MIN_DEPTH_M, Camera
 from service.geometry.ground import Ground
 from service.geometry.transforms import Array, wrap_angle
-from service.lifting import EdgeMeasurements, LiftSettings, Measurements, edge_measurements
+from service.lifting import LiftSettings
+from service.measurements import EdgeMeasurements, Measurements, edge_measurements
 from service.residuals import box_axes
 
 _SIDES, _TOP, _BOTTOM = np.arange(8), np.arange(4, 8), np.arange(4)
@@ -59,7 +60,7 @@ def lift_paper(
 
 def _lift_batch(cameras: Sequence[Camera], m: Measurements, rows: slice, settings: LiftSettings) -> tuple[Array, Array]:
     """States (n, 7) and covariances (n, 7, 7) of a slice of the measurements; the batch bounds the memory."""
-    seen = edge_measurements(cameras, m, rows, settings)
+    seen = edge_measurements(cameras, m, rows, settings.border_px)
     half = 0.5 * seen.dims_lwh
     # World axes of the box times its half size, in the camera's frame: rows are length, width, height.
     half_axes = (box_axes(seen.yaw) * half[..., None]) @ seen.R.transpose(0, 2, 1)

@@ -19,7 +19,8 @@ from service.fusion import CameraParts, FusedBoxes, FusionSettings, fuse
 from service.geometry.boxes import Boxes
 from service.geometry.camera import Camera
 from service.guidance import Guidance, GuidanceSettings, HardMode, View
-from service.lifting import LiftSettings, Measurements, lift_with_terms
+from service.lifting import LiftSettings, lift_with_terms
+from service.measurements import Measurements
 from service.measuring import Still, cut_detected, measure, refined
 from service.nets.canvas import Canvases, canvas_size
 from service.nets.depth import DepthNet, InverseDepth
@@ -30,7 +31,6 @@ from service.nets.pack import Pack
 from service.paper_fusion import PaperFusionSettings, fuse_paper
 from service.residuals import BoxProblem
 from service.site import Site
-
 
 DOUBT = 2.0
 """``FusionSettings.doubt`` of a pipeline, chosen on validation scenes (docs: fusion)."""
@@ -195,9 +195,7 @@ class Pipeline:
         if self.settings.method == "paper":
             return fuse_paper(lifted, camera_index, cameras, self.settings.paper_fusion)
         told = site.accuracy
-        settings = replace(
-            self.settings.fusion, calibration_sigma_m=told.camera_m, calibration_sigma_rad=told.camera_rad
-        )
+        settings = replace(self.settings.fusion, calibration_sigma_m=told.camera_m, calibration_sigma_rad=told.camera_rad)
         return fuse(lifted, camera_index, cameras, settings, terms)
 
     def _reported(self, boxes: Boxes) -> NDArray[np.bool_]:

@@ -31,7 +31,19 @@ _HALF_SIGNS = 0.5 * CORNER_SIGNS
 _OUTWARD = np.array([-1.0, -1.0, 1.0, 1.0])
 _DIAGONAL = np.arange(STATE_DIM)
 _PER_BOX = (
-    *("R", "t", "origin", "edges", "edge_weight", "hinged", "tangents", "tangent_weight", "directions", "prior", "prior_weight"),
+    *(
+        "R",
+        "t",
+        "origin",
+        "edges",
+        "edge_weight",
+        "hinged",
+        "tangents",
+        "tangent_weight",
+        "directions",
+        "prior",
+        "prior_weight",
+    ),
     *("ground_weight", "ray", "depth", "depth_weight", "huber"),
 )
 

@@ -73,7 +73,7 @@ class CameraModel(_Strict):
 
 
 class AccuracyModel(_Strict):
-    """How exact the site's own numbers are, one sigma. What a survey promises; the defaults are those of ordinary roads and masts.
+    """How exact the site's own numbers are, one sigma: what a survey promises. The defaults are those of ordinary roads.
 
     Exact numbers that are called vague cost accuracy, vague ones that are called exact cost more: boxes that belong together
     then look apart.

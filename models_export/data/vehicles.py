@@ -54,8 +54,8 @@ class Vehicle:
     def crop(self, xyxy_px: Array, crop_px: int) -> tuple[NDArray[np.uint8], float, Array]:
         """What the head would see and should say of a box (4,) that is not exact.
 
-        Returns the crop (S, S, 3), alpha about that box's centre, and the true edges and tangents (12,) in the crop's sides from
-        its middle.
+        Returns the crop (S, S, 3), alpha about that box's centre, and the true edges and tangents (12,), in sides of the crop
+        from its middle.
         """
         centers = np.stack([(self.xyxy_px[:2] + self.xyxy_px[2:]) / 2, (xyxy_px[:2] + xyxy_px[2:]) / 2])
         azimuth = ray_azimuth(self.camera, centers)

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from models_export.nets.blocks import Normalise, conv
 
-
 _POOLED = 4
 
 

@@ -1,4 +1,4 @@
-"""The edge multi-bin head: a small convolutional trunk, the paper's three branches, and two more for outline and uncertainty."""
+"""The edge multi-bin head: a small convolutional trunk, the paper's three branches, and two for outline and uncertainty."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ the crop."""
 _MIN_LOG, _MAX_LOG = -3.0, 4.0
 """Limits of the predicted logarithms over those units."""
 OUTLINE_BINS, OUTLINE_REACH = 80, 1.0
-"""A reading of the outline is the mean of a distribution over as many places between -reach and reach, in the crop's sides: it is
-learned as a choice among places, and so finer and faster than as a number (SimCC, Li et al., ECCV 2022)."""
+"""A reading of the outline is the mean of a distribution over as many places between -reach and reach, in the crop's sides: it
+is learned as a choice among places, and so finer and faster than as a number (SimCC, Li et al., ECCV 2022)."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class MultibinConfig:
     """Widest image that crops are cut from, px: twice what the detector sees, for crops cost little and show more. None: what
     the detector sees."""
     bin_centers_rad: tuple[float, ...] = (0.0, math.pi / 2, math.pi, -math.pi / 2)
-    """Driving away from the camera, to its left, towards it, to its right: what looks alike from the side has bins of its own."""
+    """Driving away from the camera, to its left, towards it, to its right: what looks alike from the side has its own bins."""
     bin_overlap_rad: float = 0.1
     """How far a bin reaches into its neighbour, a side."""
     mean_dims_lwh: tuple[tuple[float, float, float], ...] = ((4.4, 1.8, 1.5),) * 4

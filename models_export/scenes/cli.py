@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +15,15 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from models_export.scenes.cameras import RIGS
-from models_export.scenes.evaluation import check_digest, evaluation_digest, evaluation_folder, missing_requests
+from models_export.scenes.evaluation import (
+    SCENES,
+    STEPS,
+    check_digest,
+    drawn_requests,
+    evaluation_digest,
+    evaluation_folder,
+    missing_requests,
+)
 from models_export.scenes.light import WEATHERS
 from models_export.scenes.preview import contact_sheet, write_picture
 from models_export.scenes.renderer import Renderer
@@ -103,10 +112,24 @@ def evaluation(
     out: Annotated[Path, typer.Option(help="Cache folder; scenes that it holds already are kept.")],
     scenario: Annotated[Scenario | None, typer.Option(help="Only one of the three sets.")] = None,
     digest: Annotated[bool, typer.Option("--digest", help="Only print this generator's digest.")] = False,
+    drawn: Annotated[bool, typer.Option("--random", help="Another set: seeds, worlds and rigs drawn now.")] = False,
+    draw: Annotated[int | None, typer.Option(min=0, help="With --random: repeat the draw of this number.")] = None,
+    scenes: Annotated[int, typer.Option(min=1, help="With --random: scenes of each scenario.")] = SCENES,
+    steps: Annotated[int, typer.Option(min=1, help="With --random: frame sets a scene.")] = STEPS,
 ) -> None:
-    """Render the fixed evaluation set: easy, moderate and hard, 100 frame sets of four cameras each."""
+    """Render the fixed evaluation set: easy, moderate and hard, 100 frame sets of four cameras each. Or one drawn at random."""
     if digest:
         print(evaluation_digest())
+        return
+    if drawn:
+        number = secrets.randbelow(2**32) if draw is None else draw
+        console.print(f"draw {number}: repeat it with --random --draw {number}")
+        requests = [r for r in drawn_requests(number, scenes, steps) if scenario in (None, r.scenario)]
+        try:
+            render_all(requests, [out / evaluation_folder(r) for r in requests])
+        except QuadliftError as error:
+            console.print(f"[red]{error}")
+            raise typer.Exit(1) from error
         return
     try:
         check_digest()

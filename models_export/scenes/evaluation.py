@@ -29,6 +29,8 @@ EVALUATION_SHA256 = "1192333835ef20e89ee143da47ccfe0f1b38d222ea3272412d12fd69336
 SCENES, STEPS, RATE_HZ = 10, 10, 5.0
 """Per scenario: 100 frame sets of four cameras."""
 _SEED_STRIDE = 100_000
+_FIRST_DRAWN, _DRAWN_SEEDS = FIRST_RESERVED_SEED + 1_000_000, 1_000_000_000
+"""Seeds of the sets that are drawn."""
 _WORLDS: Mapping[str, tuple[str, ...]] = {
     "easy": STRAIGHT_WORLDS,
     "moderate": ("intersection", "curve", "t-junction", "curve", "intersection", "garage"),
@@ -48,6 +50,23 @@ def evaluation_requests(scenario: str) -> tuple[SceneRequest, ...]:
         if rig == "turn" and world == "straight":
             rig = "sides"
         requests.append(SceneRequest(first + k, world, STEPS, RATE_HZ, scenario=scenario, rig=rig, distorted=k % 5 == 4))
+    return tuple(requests)
+
+
+def drawn_requests(draw: int, scenes: int, steps: int) -> tuple[SceneRequest, ...]:
+    """A second evaluation set, another for every number ``draw``: the same three scenarios with seeds, worlds and rigs drawn.
+
+    Its seeds are reserved ones, which no training scene has, and none of the fixed set's.
+    """
+    rng, requests = np.random.default_rng(draw), []
+    for scenario in SCENARIOS:
+        for seed in rng.choice(_DRAWN_SEEDS, scenes, replace=False):
+            world = str(rng.choice(_WORLDS[scenario]))
+            rig = str(rng.choice([rig for rig in RIGS if rig != "turn" or world != "straight"]))
+            distorted = bool(rng.random() < 1 / 5)
+            requests.append(
+                SceneRequest(_FIRST_DRAWN + int(seed), world, steps, RATE_HZ, scenario=scenario, rig=rig, distorted=distorted)
+            )
     return tuple(requests)
 
 

@@ -26,8 +26,8 @@ from service.geometry.transforms import Array
 JITTER, MAX_JITTER = 0.08, 0.2
 """Standard deviation and limit of a box edge in training over the box's side: the detector's boxes are not exact either."""
 SIZE_WEIGHT, OUTLINE_WEIGHT, PLACES_WEIGHT = 4.0, 2.0, 6.0
-"""Of the likelihoods of size and outline, and of the outline's places, over the angle's. At 1 the head learned little more of a size than its class's mean; the
-outline is what the lift takes sizes and places from."""
+"""Of the likelihoods of size and outline, and of the outline's places, over the angle's. At 1 the head learned little more of a
+size than its class's mean; the outline is what the lift takes sizes and places from."""
 CROP_AUGMENT = AugmentConfig(motion_px=4, jpeg_quality=(40, 95), noise_sigma=8.0, night=0.06, fog=0.06)
 """Milder than a picture's: a crop is a few dozen pixels of it, and streaks and blocks do not shrink with it."""
 _MIRRORED = [2, 1, 0, 3, *(4 + TANGENT_DEGREES.index((180 - angle) % 360) for angle in TANGENT_DEGREES)]
@@ -112,9 +112,7 @@ class MultibinTask:
         terms = likelihood_loss(errors / units, log_sigma - units.log()).mean(0)
         likelihood = {"angle_nll": terms[0], "size_nll": terms[1:4].mean(), "outline_nll": terms[4:].mean()}
         places = places_loss(logits, batch["outline"], outline_places().to(logits.device)).mean()
-        weighted = (
-            SIZE_WEIGHT * likelihood["size_nll"] + OUTLINE_WEIGHT * likelihood["outline_nll"] + PLACES_WEIGHT * places
-        )
+        weighted = SIZE_WEIGHT * likelihood["size_nll"] + OUTLINE_WEIGHT * likelihood["outline_nll"] + PLACES_WEIGHT * places
         total = paper["total"] + likelihood["angle_nll"] + weighted
         return {**paper, **likelihood, "places": places, "total": total}
 

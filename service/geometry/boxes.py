@@ -113,7 +113,7 @@ def project_extents(camera: Camera, center: ArrayLike, dims_lwh: ArrayLike, yaw:
 
 
 def project_corners(camera: Camera, center: ArrayLike, dims_lwh: ArrayLike, yaw: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
-    """Corners (N, 8, 2) of boxes in a camera, px, in the order of ``CORNER_SIGNS``, and in_front (N,), as ``project_extents``."""
+    """Corners (N, 8, 2) of boxes in a camera, px, in the order of ``CORNER_SIGNS``, and in_front (N,) as above."""
     corners_cam = transform_points(camera.T_cam_world, box_corners(center, dims_lwh, yaw))
     return camera.project_cam(corners_cam), np.all(corners_cam[..., 2] > MIN_DEPTH_M, axis=-1)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,7 +21,7 @@ CONTEXT = 1.3
 """Side of the square crop over the longer side of the 2D box: a margin, and the box's shape kept."""
 
 UNCERTAIN = ("alpha", "length", "width", "height", "left", "top", "right", "bottom")
-"""Order of the standard deviations that a head may predict: radians, metres, and sides of the crop. Those of the tangents, where
+"""Order of the standard deviations that a head may predict: radians, metres, and sides of the crop. Those of the tangents, if
 it reads them too, come after, one for each of ``TANGENT_DEGREES``."""
 OUTLINE = slice(4, None)
 """Of these, the edges and tangents: lengths in the image."""
@@ -77,15 +78,19 @@ class MultibinSpec:
             raise PackError(f"metadata is incomplete: {error!r}.", field="multibin", remedy="Export the pack again.") from error
 
 
-def _sigma_scale(values: object, tangents_deg: object) -> Array | None:
-    """Factors (8,) or (16,) from metadata. Raises ValueError when they are not positive numbers, one for each standard deviation,
-    or when the tangents' directions are others than the service's."""
-    if tuple(tangents_deg) not in ((), TANGENT_DEGREES):  # type: ignore[arg-type]
+def _sigma_scale(values: object, tangents_deg: Any) -> Array | None:
+    """Factors (8,) or (16,) from metadata.
+
+    Raises ValueError when they are not positive numbers, one for each standard deviation, or when the tangents' directions are
+    others than the service's.
+    """
+    tangents = tuple(tangents_deg)
+    if tangents and tangents != TANGENT_DEGREES:
         raise ValueError(f"tangents_deg {tangents_deg!r}: {TANGENT_DEGREES} are expected")
     if values is None:
         return None
     scale = np.asarray(values, dtype=np.float64)
-    count = len(UNCERTAIN) + len(tuple(tangents_deg))  # type: ignore[arg-type]
+    count = len(UNCERTAIN) + len(tangents)
     if scale.shape != (count,) or not (np.isfinite(scale).all() and (scale > 0).all()):
         raise ValueError(f"sigma_scale {values!r}: {count} positive numbers are expected")
     return scale
@@ -133,7 +138,6 @@ class MultibinEstimates:
     tangents_px: Array | None = None
     """(N, 8) reach of the vehicle in ``TANGENT_DIRECTIONS``, px of the image of the crops; None: not read."""
 
-
     def with_rows(self, rows: NDArray[np.int64], better: MultibinEstimates) -> MultibinEstimates:
         """These with those of ``better`` in the rows (M,)."""
         merged: dict[str, Array | None] = {}
@@ -166,8 +170,8 @@ class Multibin:
         estimates = decode_multibin(vectors, confidence, residual, cls, crops.center_px, self.spec)
         if scale is None:
             return estimates
-        outline, log_sigma = more
-        return _with_outline(estimates, outline, np.exp(log_sigma.astype(np.float64)) * scale, crops.window)
+        raw, log_sigma = more
+        return _with_outline(estimates, raw, np.exp(log_sigma.astype(np.float64)) * scale, crops.window)
 
 
 def _with_outline(
@@ -181,7 +185,7 @@ def _with_outline(
 
 
 def window_middles(window: NDArray[np.int64]) -> Array:
-    """Middles (N, 2), px, of windows (N, 3). Pixel centres lie at integers: a window begins half a pixel before its first one."""
+    """Middles (N, 2), px, of windows (N, 3). Pixel centres lie at integers: a window begins half a pixel before the first."""
     middles: Array = window[:, :2] - 0.5 + 0.5 * window[:, 2:]
     return middles
 

@@ -10,10 +10,10 @@ from models_export.nets.depth import DepthConfig, EdgeDepth
 from models_export.nets.detector import DetectorConfig, EdgeDetector
 from models_export.nets.multibin import OUTLINE_REACH, EdgeMultibin, MultibinConfig
 from models_export.train.detector import assign, decode, detector_loss
+from service.geometry.boxes import TANGENT_DEGREES
 from service.nets.decoding import decode_heads
 from service.nets.detector_spec import DetectorSpec
 from service.nets.error_model import ErrorModel
-from service.geometry.boxes import TANGENT_DEGREES
 from service.nets.multibin import UNCERTAIN
 
 CONFIG = DetectorConfig(classes=("car",))

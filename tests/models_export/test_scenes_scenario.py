@@ -10,7 +10,13 @@ import pytest
 
 from models_export.data.dataset import SceneTruth
 from models_export.scenes import evaluation
-from models_export.scenes.evaluation import EVALUATION_SHA256, evaluation_digest, evaluation_folder, evaluation_requests
+from models_export.scenes.evaluation import (
+    EVALUATION_SHA256,
+    drawn_requests,
+    evaluation_digest,
+    evaluation_folder,
+    evaluation_requests,
+)
 from models_export.scenes.light import CLEAR_WEATHERS
 from models_export.scenes.plan import ScenePlan
 from models_export.scenes.request import FIRST_RESERVED_SEED, SceneRequest
@@ -23,7 +29,7 @@ from models_export.scenes.scenario import (
     vehicle_difficulty,
 )
 from models_export.scenes.writer import scene_document
-from service.errors import QuadliftError
+from service.errors import InputError, QuadliftError
 
 
 def truth_of(yaw: list[float], visible: list[list[float]]) -> SceneTruth:
@@ -136,3 +142,17 @@ def test_only_missing_scenes_are_rendered(tmp_path: Path, monkeypatch: pytest.Mo
         folder.mkdir()
         (folder / "scene.json").write_text(text)
     assert evaluation.missing_requests(tmp_path, ("easy",)) == [second, third]
+
+
+def test_drawn_sets_are_reserved_repeatable_and_never_the_fixed_one() -> None:
+    first, again, other = (drawn_requests(draw, 5, 2) for draw in (7, 7, 8))
+    assert first == again
+    assert [r.scenario for r in first] == [scenario for scenario in SCENARIOS for _ in range(5)]
+    fixed = {r.seed for scenario in SCENARIOS for r in evaluation_requests(scenario)}
+    seeds = [r.seed for r in (*first, *other)]
+    assert len(set(seeds)) == len(seeds)
+    assert not fixed & set(seeds)
+    for request in (*first, *other):
+        request.check()
+        with pytest.raises(InputError, match="reserved"):
+            request.check(reserved=False)

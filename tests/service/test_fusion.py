@@ -12,7 +12,8 @@ from service.geometry.camera import Camera
 from service.geometry.ground import GroundPlane
 from service.geometry.iou import iou_3d, iou_bev
 from service.geometry.transforms import invert_rigid, pole_camera_pose, rigid, rotation_z, wrap_angle
-from service.lifting import Measurements, lift
+from service.lifting import lift
+from service.measurements import Measurements
 
 K = np.array([[642.0, 0.0, 641.5], [0.0, 642.0, 191.5], [0.0, 0.0, 1.0]])
 SIGMA_DIMS = np.array([0.2, 0.06, 0.06])

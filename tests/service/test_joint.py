@@ -13,7 +13,8 @@ from service.geometry.camera import Camera
 from service.geometry.ground import GroundPlane
 from service.geometry.transforms import invert_rigid, pole_camera_pose, rigid, rotation_z, wrap_angle
 from service.joint import shared_covariance, solve_jointly
-from service.lifting import LiftSettings, Measurements, lift_with_terms
+from service.lifting import LiftSettings, lift_with_terms
+from service.measurements import Measurements
 from service.residuals import FIXED_ROWS, normal_equations, residuals
 from service.solver import SolverSettings, covariance_of
 

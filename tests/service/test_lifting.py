@@ -11,7 +11,8 @@ from service.geometry.camera import Camera
 from service.geometry.ground import GroundPlane
 from service.geometry.iou import iou_3d
 from service.geometry.transforms import invert_rigid, pole_camera_pose, rigid, rotation_z, transform_points, wrap_angle
-from service.lifting import LiftSettings, Measurements, lift
+from service.lifting import LiftSettings, lift
+from service.measurements import Measurements
 from service.residuals import FIXED_ROWS, BoxProblem, normal_equations, residuals
 from service.solver import SolverSettings
 

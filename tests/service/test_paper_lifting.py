@@ -7,7 +7,8 @@ from service.geometry.boxes import box_states, project_extents
 from service.geometry.camera import Camera
 from service.geometry.ground import GroundPlane
 from service.geometry.transforms import invert_rigid, pole_camera_pose, rigid, rotation_z, wrap_angle
-from service.lifting import LiftSettings, Measurements, lift
+from service.lifting import LiftSettings, lift
+from service.measurements import Measurements
 from service.paper_lifting import CONFIGURATIONS, lift_paper
 
 K = np.array([[642.0, 0.0, 641.5], [0.0, 642.0, 191.5], [0.0, 0.0, 1.0]])
