@@ -24,7 +24,7 @@ def edge_recipe(
     """The pack as it is shipped, or with networks of other shapes."""
     return PackRecipe(
         name="edge",
-        version="2",
+        version="3",
         networks=(
             _detector(detector or DetectorConfig()),
             _multibin(multibin or MultibinConfig()),
@@ -40,7 +40,7 @@ def _detector(config: DetectorConfig) -> NetworkRecipe:
         config=config,
         build=EdgeDetector,
         task=DetectorTask,
-        training=TrainConfig(steps=4500, batch_size=16),
+        training=TrainConfig(steps=12000, batch_size=16),
         outputs=("p8", "p16", "p32"),
         metadata=detector_metadata,
         real=RealData.detection,
@@ -54,7 +54,7 @@ def _multibin(config: MultibinConfig) -> NetworkRecipe:
         config=config,
         build=EdgeMultibin,
         task=MultibinTask,
-        training=TrainConfig(steps=6500, batch_size=128, learning_rate=1e-3),
+        training=TrainConfig(steps=20000, batch_size=128, learning_rate=1.5e-3),
         outputs=("vectors", "confidence", "residual", "outline", "log_sigma"),
         metadata=uncertain_multibin_metadata,
         real=RealData.vehicles,
