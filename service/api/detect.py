@@ -67,11 +67,14 @@ async def detect(
     return Response(content, media_type="application/json")
 
 
-async def answer(service: Service, frame_set: FrameSet, *, per_camera: bool = False) -> bytes:
-    """Run a frame set, publish its message if the site's stream runs, and give the message as JSON."""
+async def answer(service: Service, frame_set: FrameSet, *, per_camera: bool = False, newest_wins: bool = False) -> bytes:
+    """Run a frame set, publish its message if the site's stream runs, and give the message as JSON.
+
+    newest_wins: while it waits for a worker, a newer set of its site may take its place (OverloadError).
+    """
     live = service.live.site(frame_set.site.id)
     with live.passage(frame_set.captured_at_ns) as passage:
-        result, not_finite = finite_only(await service.scheduler.submit(frame_set))
+        result, not_finite = finite_only(await service.scheduler.submit(frame_set, newest_wins=newest_wins))
         if not_finite:
             service.telemetry.dropped(Drop.NOT_FINITE, not_finite)
         tracked, track_ms = await live.track(passage, result)

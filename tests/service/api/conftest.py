@@ -13,11 +13,11 @@ import httpx
 import numpy as np
 import pytest
 import simplejpeg
-import uvicorn
 from fastapi import FastAPI
 from websockets.sync.client import ClientConnection, connect
 
 from service.api.app import create_app
+from service.api.server import Server, server_config
 from service.errors import FrameError
 from service.frames import FrameSet, decode
 from service.geometry.boxes import Boxes
@@ -124,10 +124,10 @@ def wait_until(condition: Callable[[], bool]) -> None:
 class ServiceClient(httpx.Client):
     """A client of a service that really listens, in a thread of the test's process."""
 
-    def __init__(self, app: FastAPI, headers: dict[str, str] | None = None) -> None:
+    def __init__(self, settings: Settings, app: FastAPI, headers: dict[str, str] | None = None) -> None:
         self.app = app
-        config = uvicorn.Config(app, port=0, log_config=None, timeout_graceful_shutdown=2)
-        self._server = uvicorn.Server(config)
+        config = server_config(settings, app)
+        self._server = Server(config, lambda: app.state.service.drain(), settings.drain_s)
         self._thread = threading.Thread(target=self._server.run)
         self._thread.start()
         wait_until(lambda: self._server.started or not self._thread.is_alive())
@@ -151,7 +151,8 @@ def start(pipeline: FakePipeline) -> Iterator[Callable[..., ServiceClient]]:
     clients: list[ServiceClient] = []
 
     def build(ready: bool = True, headers: dict[str, str] | None = None, **options: Any) -> ServiceClient:
-        client = ServiceClient(create_app(Settings(workers=2, **options), lambda _: pipeline), headers)
+        settings = Settings(**{"workers": 2, "port": 0, "drain_s": 2, "run_limit_ms": 60_000, **options})
+        client = ServiceClient(settings, create_app(settings, lambda _: pipeline), headers)
         clients.append(client)
         assert client.put("/sites/demo", json=site_body()).status_code == 201
         if ready:

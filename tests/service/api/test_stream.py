@@ -141,7 +141,7 @@ def test_the_newest_message_wins() -> None:
         for text in (b"1", b"2", b"3"):
             reader.offer(Encoded(text, None))
         newest = await reader.take()
-        reader.close()
+        reader.close("over")
         return newest, await reader.take(), telemetry.drops()
 
     newest, end, drops = asyncio.run(scenario())
