@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from service.frames import FrameSet
+from service.logs import request_id
 
 if TYPE_CHECKING:
     from service.pipeline import SetResult
@@ -24,6 +25,8 @@ class Job:
     newest_wins: bool = False
     """It came over a camera stream: a newer one of its site may take its place while it waits."""
     future: Future[SetResult] = field(default_factory=Future)
+    request_id: str | None = field(default_factory=request_id.get)
+    """On whose behalf it runs, for the log."""
 
     @property
     def site_id(self) -> str:

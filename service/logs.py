@@ -46,8 +46,8 @@ def configure_logging(format: LogFormat, level: str = "info", stream: TextIO | N
         root.removeHandler(other)
     root.addHandler(handler)
     root.setLevel(level.upper())
-    # It names every connection's address with its query, at each handshake: we have lines of our own for that.
-    logging.getLogger("uvicorn.error").addFilter(_is_no_handshake)
+    # Of connections we have lines of our own, which name the site.
+    logging.getLogger("uvicorn.error").addFilter(_is_not_of_a_connection)
 
 
 class LogHandler(logging.StreamHandler[TextIO]):
@@ -98,5 +98,6 @@ def _context(record: logging.LogRecord) -> dict[str, Any]:
     return {name: value for name, value in own.items() if value is not None}
 
 
-def _is_no_handshake(record: logging.LogRecord) -> bool:
-    return "WebSocket" not in str(record.msg)
+def _is_not_of_a_connection(record: logging.LogRecord) -> bool:
+    text = str(record.msg)
+    return "WebSocket" not in text and not text.startswith("connection ")

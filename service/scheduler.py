@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Protocol
 from service.errors import OverloadError, QuadliftError
 from service.fair_queue import FairQueue, Job
 from service.frames import FrameSet
+from service.logs import on_behalf_of
 from service.telemetry import Drop, Telemetry
 from service.workers import WorkerPool
 
@@ -211,17 +212,18 @@ class Scheduler:
                 self._telemetry.dropped(Drop.CANCELLED)
 
     def _run(self, job: Job) -> None:
-        try:
-            result = self._runner.run(job.frame_set)
-        except QuadliftError as error:
-            job.fail(error)
-        except Exception:
-            # Whatever a network does must not end the worker, nor tell the caller about our insides.
-            logger.exception("A frame set of site '%s' failed", job.site_id, extra={"site": job.site_id})
-            if job.fail(QuadliftError("the networks failed on this frame set.", remedy="See the service's log.")):
-                self._telemetry.dropped(Drop.FAILED)
-        else:
-            job.succeed(result)
+        with on_behalf_of(job.request_id):
+            try:
+                result = self._runner.run(job.frame_set)
+            except QuadliftError as error:
+                job.fail(error)
+            except Exception:
+                # Whatever a network does must not end the worker, nor tell the caller about our insides.
+                logger.exception("A frame set of site '%s' failed", job.site_id, extra={"site": job.site_id})
+                if job.fail(QuadliftError("the networks failed on this frame set.", remedy="See the service's log.")):
+                    self._telemetry.dropped(Drop.FAILED)
+            else:
+                job.succeed(result)
 
     def _is_dead(self, job: Job) -> bool:
         """Whether nobody waits for a job any more, or it has waited too long."""

@@ -149,7 +149,7 @@ class WorkerPool:
         worker.is_abandoned = True
         logger.error(
             "%s hangs and is abandoned: set %d has been running for %.1f s",
-            worker.thread.name, job.frame_set.sequence, took_s, extra={"site": job.site_id},
+            worker.thread.name, job.frame_set.sequence, took_s, extra={"site": job.site_id, "request_id": job.request_id},
         )  # fmt: skip
         self._telemetry.restarted(Restart.HUNG)
         if job.fail(RunTimeoutError(took_s)):

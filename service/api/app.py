@@ -90,7 +90,7 @@ def create_app(
     app = FastAPI(title="Quadlift", version=__version__, description=_DESCRIPTION, lifespan=lifespan, redoc_url=None)
     app.add_middleware(Access, tokens=tokens, allowed_origins=settings.allowed_origins)
     # The one added last is the outermost: refusals are counted too, and all have an id.
-    app.add_middleware(Guard, telemetry=telemetry)
+    app.add_middleware(Guard, telemetry=telemetry, is_stopping=lambda: app.state.service.phase == "stopping")
     app.add_middleware(RequestIds)
     install_error_handlers(app)
     for room in (detect, sites, stream, ingest, health):
@@ -117,7 +117,8 @@ def open_store(settings: Settings) -> SitesStore:
     store = SitesStore(settings.data_dir, max_sites=settings.max_sites, max_cameras=settings.max_cameras)
     for path in settings.sites:
         try:
-            store.put(load_site(path))
+            # A disk that became read-only must not keep a restarted service from its work.
+            store.put(load_site(path), must_keep=False)
         except CalibrationError as error:
             raise CalibrationError(f"{error.field}: {error.message}", field=str(path), remedy=error.remedy) from error
     return store

@@ -42,7 +42,7 @@ _REQUEST_BODY: dict[str, Any] = {
 @router.post(
     "/detect",
     openapi_extra=_REQUEST_BODY,
-    responses={200: {"model": Detections}, **{code: {"model": ErrorMessage} for code in (404, 408, 413, 422, 503)}},
+    responses={200: {"model": Detections}, **{code: {"model": ErrorMessage} for code in (404, 408, 413, 422, 503, 504)}},
 )
 async def detect(
     request: Request,

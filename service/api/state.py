@@ -28,6 +28,8 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 _MIN_RUN_LIMIT_S = 1.5
 """With the time between two looks, a worker that hangs is replaced within two seconds."""
+_RUN_LIMIT_WARM_UPS = 3
+"""A warm-up takes about as long as a set of four frames, plus what only the first run takes."""
 _WORK_SHARE = 0.8
 """Of the time to stop: what frame sets may take of it; the rest is for their answers."""
 
@@ -89,7 +91,7 @@ class Service:
             return
         limit_ms = self.settings.run_limit_ms
         took_s = time.monotonic() - began
-        self.scheduler.run_limit_s = max(_MIN_RUN_LIMIT_S, 10 * took_s) if limit_ms is None else limit_ms / 1e3
+        self.scheduler.run_limit_s = max(_MIN_RUN_LIMIT_S, _RUN_LIMIT_WARM_UPS * took_s) if limit_ms is None else limit_ms / 1e3
         if self.phase == "starting":
             self.phase = "ready"
             logger.info("ready; a frame set may run for %.1f s", self.scheduler.run_limit_s)
