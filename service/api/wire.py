@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import struct
 from typing import cast
 
 from starlette.websockets import WebSocket
@@ -16,6 +17,7 @@ from websockets.http11 import Request
 
 _EXTENSION = "quadlift.wire"
 _GOING_AWAY = 1001
+_RESET = struct.pack("ii", 1, 0)
 _SOCKET_BUFFER = 64 * 1024
 _WRITE_BUFFER = 16 * 1024
 _FAREWELL_S = 5.0
@@ -37,6 +39,10 @@ class Wire(WebSocketsSansIOProtocol):
 
     def abort(self) -> None:
         """Break the connection off at once; what is still to be sent is lost."""
+        own_socket: socket.socket | None = self.transport.get_extra_info("socket")
+        if own_socket is not None and not self.transport.is_closing():
+            # Without this the system would go on trying to send what it holds, to a peer that does not read.
+            own_socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
         self.transport.abort()
 
     def limit_buffers(self) -> None:

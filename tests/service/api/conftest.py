@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -138,11 +139,20 @@ class ServiceClient(httpx.Client):
         """Subscribe to a stream."""
         return connect(f"ws://{self.address}{path}", open_timeout=10, compression=None)
 
-    def shut_down(self) -> None:
-        self.close()
+    def ask_to_stop(self) -> None:
+        """What SIGTERM does."""
         self._server.should_exit = True
+
+    def join(self) -> None:
+        """Wait until the service has stopped."""
         self._thread.join(10)
         assert not self._thread.is_alive(), "the service did not stop"
+
+    def shut_down(self) -> None:
+        """Stop the service, if it has not."""
+        self.close()
+        self.ask_to_stop()
+        self.join()
 
 
 @pytest.fixture
@@ -172,10 +182,25 @@ def client(start: Callable[..., ServiceClient]) -> ServiceClient:
     return start()
 
 
+def open_and_never_read(address: str) -> socket.socket:
+    """A subscriber with small buffers that takes no byte after the handshake."""
+    host, port = address.split(":")
+    raw = socket.socket()
+    raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    raw.connect((host, int(port)))
+    raw.sendall(
+        f"GET /stream/demo HTTP/1.1\r\nHost: {address}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+    )
+    assert b"101" in raw.recv(16)
+    return raw
+
+
 class Tools:
     """What tests of the API use; a fixture, since test modules import nothing from each other."""
 
     jpeg = staticmethod(jpeg)
+    open_and_never_read = staticmethod(open_and_never_read)
     png = staticmethod(png)
     one_box = staticmethod(one_box)
     camera_document = staticmethod(camera_document)
