@@ -30,6 +30,7 @@ _HELP = {
     "scenes": "Render simulated scenes for training and tests.",
     "train": "Train the networks.",
     "export": "Export trained networks to an ONNX pack.",
+    "tune": "Measure which workers and threads do most on this machine.",
     "import-darknet": "Make a pack around YOLOv3 weights in a Darknet file.",
     "import-detector": "Wrap an ONNX detector of your own into a pack.",
     "carla": "Capture scenes from a CARLA server.",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 
 from starlette.requests import ClientDisconnect
@@ -31,7 +32,7 @@ class Guard:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        status = 0
+        status, began = 0, time.monotonic()
 
         async def watch(message: Message) -> None:
             nonlocal status
@@ -53,3 +54,4 @@ class Guard:
             await error_response(INTERNAL)(scope, receive, watch)
         finally:
             self._telemetry.request(getattr(scope.get("route"), "path", _UNMATCHED), status)
+            logger.debug("%s %s: %d after %.1f ms", scope["method"], scope["path"], status, 1e3 * (time.monotonic() - began))
