@@ -69,6 +69,10 @@ class FairQueue:
         """Waiting sets that no newer one may replace."""
         return self._posted
 
+    def posted_of(self, site_id: str) -> int:
+        """The same of one site."""
+        return sum(not job.newest_wins for job in self._lanes.get(site_id, ()))
+
     def add(self, job: Job, *, is_worker_free: bool = False) -> Job | None:
         """Queue a job. Gives the job whose place it took, if any: that one waits no more.
 
@@ -99,7 +103,7 @@ class FairQueue:
 
     def evict_for(self, site_id: str) -> Job | None:
         """The newest posted job of the site that has most of them, if that leaves it no fewer than ``site_id`` then has."""
-        posted = {site: sum(not job.newest_wins for job in lane) for site, lane in self._lanes.items()}
+        posted = {site: self.posted_of(site) for site in self._lanes}
         heaviest = max(posted, key=lambda site: posted[site], default=site_id)
         if posted.get(heaviest, 0) < posted.get(site_id, 0) + 2:
             return None

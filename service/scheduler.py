@@ -68,7 +68,8 @@ class Scheduler:
     ) -> None:
         """Start the workers.
 
-        queue_size: posted frame sets that may wait beside those being run; of camera streams one a site waits beside them.
+        queue_size: posted frame sets that may wait beside those being run; of every site one may wait in any case, and one of
+        its camera streams.
         deadline_s: seconds that one may wait. max_abandoned: threads that may hang before workers are lost for good.
         """
         self.run_limit_s = run_limit_s
@@ -183,7 +184,8 @@ class Scheduler:
         if self._queue.posted < room:
             return None
         evicted = self._queue.evict_for(site_id)
-        if evicted is None:
+        # However many sites there are, each may have one set waiting: otherwise loud ones would be luckier.
+        if evicted is None and self._queue.posted_of(site_id):
             self._telemetry.dropped(Drop.QUEUE_FULL)
             raise OverloadError(
                 f"{self._queue.posted} frame sets are waiting already.", remedy="Send fewer sets a second, or add workers."

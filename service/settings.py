@@ -53,8 +53,8 @@ class Settings(BaseSettings):
     intra_op_threads: Annotated[int, Field(ge=1, le=256)] = 1
     """Threads inside the networks for each worker."""
     queue_size: Annotated[int, Field(ge=1)] = 16
-    """Posted frame sets that may wait for a worker; one more is answered 503. Of the camera streams one set a site waits
-    beside them, the newest."""
+    """Posted frame sets that may wait for a worker; one more is answered 503. Of every site one may wait in any case, and of its
+    camera streams one more, the newest."""
     deadline_ms: Annotated[float, Field(gt=0)] = 1000.0
     """A frame set that has waited this long for a worker is answered 503 instead of being run. Milliseconds."""
     run_limit_ms: Annotated[float, Field(gt=0)] | None = None
@@ -130,7 +130,7 @@ class Settings(BaseSettings):
     """An idle connection is closed after this time. Seconds."""
     drain_s: Annotated[float, Field(gt=0)] = 10.0
     """Time to finish what was accepted when the service is asked to stop. Seconds."""
-    reader_stall_s: Annotated[float, Field(gt=0)] = 3.5
+    reader_stall_s: Annotated[float, Field(gt=0)] = 3.0
     """A stream reader whose connection has taken nothing for this long is cut. Seconds."""
     log_format: Literal["text", "json"] = "text"
     """Lines for people, or one JSON object a line."""

@@ -18,7 +18,7 @@ from websockets.http11 import Request
 _EXTENSION = "quadlift.wire"
 _GOING_AWAY = 1001
 _RESET = struct.pack("ii", 1, 0)
-_SOCKET_BUFFER = 64 * 1024
+_SOCKET_BUFFER = 32 * 1024
 _WRITE_BUFFER = 16 * 1024
 _FAREWELL_S = 5.0
 """A connection whose app has ended is broken off after this time: its peer may never take the rest."""

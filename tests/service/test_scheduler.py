@@ -208,6 +208,16 @@ def test_a_site_that_floods_makes_room_for_one_that_does_not(
     assert telemetry.drops()["queue_full"] == 2
 
 
+def test_however_many_sites_there_are_each_may_have_one_waiting(start: Callable[..., Scheduler], runner: Runner) -> None:
+    scheduler = start(deadline_s=30, queue_size=2)
+    held = _hold_worker(scheduler, runner)
+    futures = [scheduler.enqueue(frame_set(i, f"site{i}")) for i in range(1, 9)]
+    with pytest.raises(OverloadError):
+        scheduler.enqueue(frame_set(9, "site1"))
+    runner.gate.set()
+    assert [f.result(5) for f in (held, *futures)] == list(range(9))
+
+
 def test_of_a_stream_the_newest_waits_beside_the_queue(
     start: Callable[..., Scheduler], runner: Runner, telemetry: Telemetry
 ) -> None:
