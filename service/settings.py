@@ -53,8 +53,8 @@ class Settings(BaseSettings):
     intra_op_threads: Annotated[int, Field(ge=1, le=256)] = 1
     """Threads inside the networks for each worker."""
     queue_size: Annotated[int, Field(ge=1)] = 16
-    """Posted frame sets that may wait for a worker; one more is answered 503. Of every site one may wait in any case, and of its
-    camera streams one more, the newest."""
+    """Posted frame sets that may wait for a worker; one more is answered 503. Of every site one may wait in any case, and of
+    its camera streams one more, the newest."""
     deadline_ms: Annotated[float, Field(gt=0)] = 1000.0
     """A frame set that has waited this long for a worker is answered 503 instead of being run. Milliseconds."""
     run_limit_ms: Annotated[float, Field(gt=0)] | None = None
@@ -132,6 +132,8 @@ class Settings(BaseSettings):
     """Time to finish what was accepted when the service is asked to stop. Seconds."""
     reader_stall_s: Annotated[float, Field(gt=0)] = 3.0
     """A stream reader whose connection has taken nothing for this long is cut. Seconds."""
+    ping_s: Annotated[float, Field(gt=0)] = 20.0
+    """A WebSocket's peer is asked for a sign of life this often, and cut when it gives none for as long again. Seconds."""
     log_format: Literal["text", "json"] = "text"
     """Lines for people, or one JSON object a line."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"

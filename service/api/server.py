@@ -27,6 +27,8 @@ def server_config(settings: Settings, app: Any) -> uvicorn.Config:
         timeout_keep_alive=settings.timeout_keep_alive_s,
         limit_concurrency=settings.limit_concurrency,
         ws=Wire,
+        ws_ping_interval=settings.ping_s,
+        ws_ping_timeout=settings.ping_s,
         # Only camera streams send large messages: one frame and its header.
         ws_max_size=min(settings.ws_max_size, settings.max_frame_bytes + settings.ingest_max_header_bytes + 4),
         ssl_certfile=settings.tls_cert,

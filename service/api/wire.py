@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import socket
 import struct
+from contextlib import suppress
 from typing import cast
 
 from starlette.websockets import WebSocket
@@ -40,9 +41,11 @@ class Wire(WebSocketsSansIOProtocol):
     def abort(self) -> None:
         """Break the connection off at once; what is still to be sent is lost."""
         own_socket: socket.socket | None = self.transport.get_extra_info("socket")
-        if own_socket is not None and not self.transport.is_closing():
-            # Without this the system would go on trying to send what it holds, to a peer that does not read.
-            own_socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+        if own_socket is not None:
+            # Without this the system would go on trying to send what it holds, to a peer that does not read. Where the
+            # socket is closed already there is nothing left to do.
+            with suppress(OSError):
+                own_socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
         self.transport.abort()
 
     def limit_buffers(self) -> None:

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from benchmarks import tune
 from service.settings import usable_cores
-from service.tuning import Candidate, candidates
+from service.tuning import Candidate, Trial, candidates
 
 
 @pytest.fixture(autouse=True)
@@ -36,11 +36,16 @@ def test_it_measures_and_writes(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["service.env"]
 
 
-def test_a_limit_that_nothing_keeps_is_told() -> None:
-    result = CliRunner().invoke(tune.app, ["--seconds", "0.5", "--cameras", "1", "--latency-ms", "1"])
+def test_a_limit_that_nothing_keeps_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    trials = [Trial(Candidate(2, 1), 60, 2.0, [66.0] * 60), Trial(Candidate(1, 1), 20, 1.0, [50.0] * 20)]
+    monkeypatch.setattr(tune, "measure", lambda *_: trials)
+    result = CliRunner().invoke(tune.app, ["--latency-ms", "1"], env={"COLUMNS": "120"})
     assert result.exit_code == 0, result.output
     assert "No way keeps 1 ms" in result.output
-    assert "QUADLIFT_WORKERS=1" in result.output
+    assert result.stdout.endswith("QUADLIFT_WORKERS=1\nQUADLIFT_INTRA_OP_THREADS=1\n")
+    assert "30.00" in result.stdout
+    result = CliRunner().invoke(tune.app, ["--latency-ms", "66"])
+    assert result.stdout.endswith("QUADLIFT_WORKERS=2\nQUADLIFT_INTRA_OP_THREADS=1\n")
 
 
 def test_an_unknown_pack_ends_in_one_line() -> None:

@@ -12,18 +12,20 @@ from websockets.sync.client import connect
 from service.logs import request_id
 
 
-@pytest.mark.parametrize("given", ["job-17", "A", "a.b_c-d", "x" * 64])
-def test_a_callers_id_comes_back(client: Any, given: str) -> None:
-    for path in ("/health/live", "/sites/nowhere", "/no/such/address"):
-        assert client.get(path, headers={"X-Request-ID": given}).headers.get_list("x-request-id") == [given]
+def test_a_callers_id_comes_back(client: Any) -> None:
+    for given in ("job-17", "A", "a.b_c-d", "x" * 64):
+        for path in ("/health/live", "/sites/nowhere", "/no/such/address"):
+            assert client.get(path, headers={"X-Request-ID": given}).headers.get_list("x-request-id") == [given]
 
 
-@pytest.mark.parametrize("given", ["", "two words", "x" * 65, "-leading", 'quote"', "né"])
-def test_what_is_no_id_is_replaced(client: Any, given: str) -> None:
-    made = [client.get("/health/live", headers={"X-Request-ID": given.encode()}).headers["x-request-id"] for _ in range(2)]
-    assert given not in made
-    assert made[0] != made[1]
-    assert all(len(one) == 32 and int(one, 16) >= 0 for one in made)
+def test_what_is_no_id_is_replaced(client: Any) -> None:
+    seen = set()
+    for given in ("", "two words", "x" * 65, "-leading", 'quote"', "né"):
+        made = client.get("/health/live", headers={"X-Request-ID": given.encode()}).headers["x-request-id"]
+        assert len(made) == 32
+        assert int(made, 16) >= 0
+        seen.add(made)
+    assert len(seen) == 6
 
 
 def test_a_websocket_has_one_id(client: Any) -> None:

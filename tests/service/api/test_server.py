@@ -87,6 +87,18 @@ def test_a_reader_that_takes_nothing_keeps_nobody_from_stopping(client: Any, pip
         client.join()
 
 
+def test_a_peer_without_a_sign_of_life_is_cut(start: Callable[..., Any], tools: Any) -> None:
+    client = start(ping_s=0.1)
+    with client.stream() as alive, tools.open_and_never_read(client.address) as dead:
+        assert dead.recv(1 << 16)
+        tools.wait_until(lambda: 'quadlift_stream_readers{site="demo"} 1.0' in client.get("/metrics").text)
+        with pytest.raises(ConnectionResetError):
+            _ = [dead.recv(1 << 16) for _ in range(10)]
+        alive.ping().wait(5)
+        tools.detect(client, data=AT)
+        assert alive.recv(timeout=5)
+
+
 PROGRAM = """
 import threading, time
 from types import SimpleNamespace
