@@ -101,11 +101,16 @@ class FairQueue:
             self._posted -= 1
         return job
 
-    def evict_for(self, site_id: str) -> Job | None:
-        """The newest posted job of the site that has most of them, if that leaves it no fewer than ``site_id`` then has."""
+    def heavier_than(self, site_id: str) -> str | None:
+        """The site with most posted sets, if it can lose one and then still has as many as ``site_id`` with one more."""
         posted = {site: self.posted_of(site) for site in self._lanes}
         heaviest = max(posted, key=lambda site: posted[site], default=site_id)
-        if posted.get(heaviest, 0) < posted.get(site_id, 0) + 2:
+        return heaviest if posted.get(heaviest, 0) >= posted.get(site_id, 0) + 2 else None
+
+    def evict_for(self, site_id: str) -> Job | None:
+        """Take out the newest posted job of the site that is :meth:`heavier_than` this one, if there is one."""
+        heaviest = self.heavier_than(site_id)
+        if heaviest is None:
             return None
         newest = next(job for job in reversed(self._lanes[heaviest]) if not job.newest_wins)
         self.remove(lambda job: job is newest)

@@ -116,7 +116,10 @@ class Scheduler:
             if self._stopping:
                 self._telemetry.dropped(Drop.STOPPING)
                 raise OverloadError("the service is stopping.", remedy="Try again when it has started anew.")
-            evicted = None if newest_wins else self._make_room(job.site_id)
+            evicted = None
+            if not newest_wins:
+                self._require_room(job.site_id)
+                evicted = self._queue.evict_for(job.site_id) if self._is_full() else None
             superseded = self._queue.add(job, is_worker_free=self._idle > len(self._queue))
             self._telemetry.queue(len(self._queue))
             self._changed.notify()
@@ -125,6 +128,11 @@ class Scheduler:
         if evicted is not None:
             self._refuse(evicted, Drop.QUEUE_FULL, "other sites had fewer frame sets waiting.")
         return job.future
+
+    def require_room(self, site_id: str) -> None:
+        """Raise OverloadError, counted, if a posted set of a site would be refused now: before its frames are even read."""
+        with self._changed:
+            self._require_room(site_id)
 
     async def submit(self, frame_set: FrameSet, *, newest_wins: bool = False) -> SetResult:
         """The result of a frame set, awaited; takes and raises what :meth:`enqueue` and its future do."""
@@ -174,23 +182,19 @@ class Scheduler:
             return None
         return self.run_limit_s * max(1.0, len(job.frame_set.frames) / _LIMIT_FRAMES)
 
-    def _make_room(self, site_id: str) -> Job | None:
-        """Make sure that one more posted set may wait. Gives the job that has to go for it; raises OverloadError."""
+    def _is_full(self) -> bool:
         # A job that an idle worker is about to take does not wait, so it takes no place.
-        room = self._queue_size + self._idle
-        if self._queue.posted < room:
-            return None
-        self._bury(self._queue.remove(self._is_dead))
-        if self._queue.posted < room:
-            return None
-        evicted = self._queue.evict_for(site_id)
+        return self._queue.posted >= self._queue_size + self._idle
+
+    def _require_room(self, site_id: str) -> None:
+        if self._is_full():
+            self._bury(self._queue.remove(self._is_dead))
         # However many sites there are, each may have one set waiting: otherwise loud ones would be luckier.
-        if evicted is None and self._queue.posted_of(site_id):
+        if self._is_full() and self._queue.posted_of(site_id) and self._queue.heavier_than(site_id) is None:
             self._telemetry.dropped(Drop.QUEUE_FULL)
             raise OverloadError(
                 f"{self._queue.posted} frame sets are waiting already.", remedy="Send fewer sets a second, or add workers."
             )
-        return evicted
 
     def _next(self) -> Job | None:
         """The next job worth running, for a worker; None when it may end."""

@@ -58,6 +58,8 @@ async def detect(
     arrived_at_ns = time.time_ns()
     known_site = service.store.get(site)
     service.require_ready()
+    # Refusing before the frames are read leaves the processor to the sets that were accepted.
+    service.scheduler.require_room(site)
     body = await read_body(request, service.settings.max_body_bytes, service.settings.body_receive_s)
     frames, captured_at_ns = await asyncio.to_thread(
         frames_from_form, body, request.headers.get("content-type"), known_site, service.settings.frame_limits, arrived_at_ns

@@ -113,9 +113,13 @@ def test_full_queue_is_refused_and_counted(start: Callable[..., Scheduler], runn
     with pytest.raises(OverloadError, match="2 frame sets") as caught:
         scheduler.enqueue(frame_set(3))
     assert caught.value.retry_after_s >= 1
+    with pytest.raises(OverloadError, match="2 frame sets"):
+        scheduler.require_room("demo")
+    scheduler.require_room("other")
     runner.gate.set()
     assert [f.result(5) for f in (held, *waiting)] == [0, 1, 2]
-    assert telemetry.drops()["queue_full"] == 1
+    assert telemetry.drops()["queue_full"] == 2
+    scheduler.require_room("demo")
 
 
 def test_a_set_that_waited_too_long_is_not_run(start: Callable[..., Scheduler], runner: Runner, telemetry: Telemetry) -> None:
