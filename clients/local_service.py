@@ -18,7 +18,8 @@ import httpx
 HOST = "127.0.0.1"
 READY_TIMEOUT_S = 60.0
 """Loading and warming the networks takes a few seconds; a slow disk may take longer."""
-STOP_TIMEOUT_S = 10.0
+STOP_TIMEOUT_S = 15.0
+"""More than the service takes to finish its work."""
 _POLL_S = 0.1
 
 

@@ -6,7 +6,6 @@ run, so that ``quadlift --help`` needs no extra.
 
 from __future__ import annotations
 
-import logging
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,8 +20,6 @@ from service.errors import QuadliftError
 from service.nets.providers import Provider
 
 if TYPE_CHECKING:
-    import uvicorn
-
     from service.settings import Settings
 
 COMMAND_GROUP = "quadlift.commands"
@@ -33,6 +30,7 @@ _HELP = {
     "scenes": "Render simulated scenes for training and tests.",
     "train": "Train the networks.",
     "export": "Export trained networks to an ONNX pack.",
+    "tune": "Measure which workers and threads do most on this machine.",
     "import-darknet": "Make a pack around YOLOv3 weights in a Darknet file.",
     "import-detector": "Wrap an ONNX detector of your own into a pack.",
     "carla": "Capture scenes from a CARLA server.",
@@ -63,6 +61,7 @@ def serve(
     viewer: Annotated[bool | None, typer.Option(help="Serve the viewer page.")] = None,
 ) -> None:
     """Run the service. Every setting can also be given as QUADLIFT_<NAME> in the environment; options win."""
+    from service.logs import configure_logging
     from service.settings import Settings
 
     given: dict[str, Any] = {
@@ -73,7 +72,7 @@ def serve(
         settings = Settings(**{name: value for name, value in given.items() if value is not None})
     except ValidationError as error:
         raise _fail(_settings_problem(error)) from None
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    configure_logging(settings.log_format, settings.log_level)
     _run(settings)
 
 
@@ -136,9 +135,8 @@ def _missing(entry: EntryPoint, error: ModuleNotFoundError) -> str:
 
 
 def _run(settings: Settings) -> None:
-    import uvicorn
-
     from service.api.app import create_app, default_pipeline, open_store
+    from service.api.server import Server, server_config
 
     for name in ("tls_cert", "tls_key"):
         path, other = getattr(settings, name), settings.tls_key or settings.tls_cert
@@ -148,36 +146,12 @@ def _run(settings: Settings) -> None:
         # Both are checked here, before the server starts, so that a bad file ends in one clear line.
         open_store(settings)
         pipeline = default_pipeline(settings)
-        server = uvicorn.Server(server_config(settings, create_app(settings, lambda _: pipeline)))
+        app = create_app(settings, lambda _: pipeline)
     except OSError as error:
         raise _fail(f"data_dir: {error}. Give a folder that can be written.") from None
     except QuadliftError as error:
         raise _fail(str(error)) from None
-    server.run()
-
-
-def server_config(settings: Settings, app: Any) -> uvicorn.Config:
-    """Uvicorn's configuration with the limits of the settings."""
-    import uvicorn
-
-    return uvicorn.Config(
-        app,
-        host=settings.host,
-        port=settings.port,
-        log_level="info",
-        access_log=False,
-        timeout_keep_alive=settings.timeout_keep_alive_s,
-        timeout_graceful_shutdown=settings.timeout_shutdown_s,
-        limit_concurrency=settings.limit_concurrency,
-        # Only camera streams send large messages: one frame and its header.
-        ws_max_size=min(settings.ws_max_size, settings.max_frame_bytes + settings.ingest_max_header_bytes + 4),
-        # Messages of a connection that wait in memory; the next ones wait in the network.
-        ws_max_queue=4,
-        ssl_certfile=settings.tls_cert,
-        ssl_keyfile=settings.tls_key,
-        # Boxes compress well, but it costs more time than a local network does.
-        ws_per_message_deflate=False,
-    )
+    Server(server_config(settings, app), lambda: app.state.service.drain(), settings.drain_s).run_until_signal()
 
 
 def _settings_problem(error: ValidationError) -> str:

@@ -10,6 +10,8 @@
     |   |-- UnauthorizedError (401) no token, or an unknown one
     |   `-- ForbiddenError (403)    a token without the scope, a page of a foreign origin
     |-- OverloadError (503)         busy or starting; Retry-After says when to come back
+    |-- RunTimeoutError (504)       the networks hung on a frame set
+    |-- StorageError (507)          the data folder cannot be written
     `-- PackError (500)             a pack that is missing, damaged or not what its manifest says
 
 The way of a request is bytes -> header check -> decode -> networks -> boxes; the first three raise only InputError kinds.
@@ -103,6 +105,26 @@ class OverloadError(QuadliftError):
     def __init__(self, message: str, *, retry_after_s: int = 1, remedy: str | None = None) -> None:
         super().__init__(message, remedy=remedy)
         self.retry_after_s = retry_after_s
+
+
+class RunTimeoutError(QuadliftError):
+    """The networks took so long on a frame set that it was given up."""
+
+    status = 504
+    code = "run_timeout"
+
+    def __init__(self, took_s: float) -> None:
+        super().__init__(
+            f"the networks had not finished this frame set after {took_s:.1f} s, and it was given up.",
+            remedy="Send the next one; if it happens often, see the service's log and QUADLIFT_RUN_LIMIT_MS.",
+        )
+
+
+class StorageError(QuadliftError):
+    """A change could not be kept on disk, so it was not made."""
+
+    status = 507
+    code = "storage"
 
 
 class PackError(QuadliftError):

@@ -1,7 +1,8 @@
-"""Runs frame sets on a few worker threads, behind a bounded queue with a deadline.
+"""Runs frame sets on a few worker threads, behind a bounded queue that is fair between sites, with a deadline.
 
 The networks release the interpreter lock, so each worker keeps one core busy. What cannot be run in time is refused at
-once (OverloadError, counted by reason); what a worker has begun is finished.
+once (OverloadError, counted by reason); what a worker has begun is finished, unless it hangs. Sets are run one by one:
+on two cores a network run over the frames of several sites is no faster (docs/operations.md has the figures).
 """
 
 from __future__ import annotations
@@ -10,19 +11,28 @@ import asyncio
 import logging
 import threading
 import time
-from collections import deque
+from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 from service.errors import OverloadError, QuadliftError
+from service.fair_queue import FairQueue, Job
 from service.frames import FrameSet
+from service.logs import on_behalf_of
 from service.telemetry import Drop, Telemetry
+from service.workers import WorkerPool
 
 if TYPE_CHECKING:
     from service.pipeline import SetResult
 
 logger = logging.getLogger(__name__)
+
+MAX_ABANDONED = 4
+"""Threads that may hang while other workers take their place."""
+_CHECK_S = 0.2
+"""Seconds between two looks after the workers and the queue."""
+_LIMIT_FRAMES = 4
+"""Frames of a set for which the run limit stands; a larger set may run longer in proportion."""
 
 
 class FrameSetRunner(Protocol):
@@ -37,17 +47,11 @@ class FrameSetRunner(Protocol):
         ...
 
 
-@dataclass(eq=False)
-class _Job:
-    frame_set: FrameSet
-    queued_at: float
-    future: Future[SetResult] = field(default_factory=Future)
-
-
 class Scheduler:
     """A pool of workers around one pipeline. Thread-safe.
 
-    A frame set on which the pipeline raises fails alone; the worker goes on.
+    Sites take turns. A frame set on which the pipeline raises fails alone; one on which it hangs is answered with an error,
+    and another worker takes the place of the one that hangs.
     """
 
     def __init__(
@@ -57,112 +61,188 @@ class Scheduler:
         workers: int,
         queue_size: int = 16,
         deadline_s: float = 1.0,
+        run_limit_s: float | None = None,
+        max_abandoned: int = MAX_ABANDONED,
         telemetry: Telemetry | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Start the workers.
 
-        queue_size: frame sets that may wait beside those being run. deadline_s: seconds that one may wait.
+        queue_size: posted frame sets that may wait beside those being run; of every site one may wait in any case, and one of
+        its camera streams.
+        deadline_s: seconds that one may wait. max_abandoned: threads that may hang before workers are lost for good.
         """
+        self.run_limit_s = run_limit_s
+        """Seconds that a set of up to four frames may run; beyond that its worker counts as hung. None: for ever."""
         self._runner = runner
         self._queue_size = queue_size
         self._deadline_s = deadline_s
         self._telemetry = telemetry or Telemetry()
-        self._jobs: deque[_Job] = deque()
+        self._clock = clock
+        self._queue = FairQueue()
         self._changed = threading.Condition()
         self._stopping = False
         self._idle = 0
-        self._threads = [threading.Thread(target=self._work, name=f"quadlift-worker-{i}", daemon=True) for i in range(workers)]
-        for thread in self._threads:
-            thread.start()
+        self._pool = WorkerPool(
+            self._next, self._run, size=workers, max_abandoned=max_abandoned, telemetry=self._telemetry, clock=clock
+        )
+        self._ended = threading.Event()
+        self._watch = threading.Thread(target=self._watch_over, name="quadlift-watch", daemon=True)
+        self._watch.start()
 
-    def enqueue(self, frame_set: FrameSet) -> Future[SetResult]:
+    @property
+    def working(self) -> int:
+        """Workers that do not hang."""
+        return self._pool.working
+
+    def trouble(self) -> str | None:
+        """What keeps the scheduler from doing all its work; None when nothing does."""
+        working, size = self._pool.working, self._pool.size
+        if working >= size or self._stopping:
+            return None
+        return f"{size - working} of {size} workers hang in the networks."
+
+    def enqueue(self, frame_set: FrameSet, *, newest_wins: bool = False) -> Future[SetResult]:
         """Queue a frame set. Raises OverloadError when the queue is full or the scheduler is stopping.
 
-        The future gives the SetResult, or raises FrameError (no frame could be decoded), OverloadError (deadline), or
-        QuadliftError (the networks failed). Cancel it to give up a frame set that has not begun.
+        newest_wins: it is one of a camera stream, and a newer one of its site may take its place in the queue.
+
+        The future gives the SetResult, or raises FrameError (no frame could be decoded), OverloadError (deadline, another
+        set took its place, the service ended), RunTimeoutError (the networks hung) or QuadliftError (the networks failed).
+        Cancel it to give up a frame set that has not begun.
         """
-        job = _Job(frame_set, time.monotonic())
+        job = Job(frame_set, self._clock(), newest_wins)
         with self._changed:
             if self._stopping:
                 self._telemetry.dropped(Drop.STOPPING)
                 raise OverloadError("the service is stopping.", remedy="Try again when it has started anew.")
-            # A job that an idle worker is about to take does not wait, so it takes no place.
-            room = self._queue_size + self._idle
-            if len(self._jobs) >= room:
-                self._clear_dead()
-            if len(self._jobs) >= room:
-                self._telemetry.dropped(Drop.QUEUE_FULL)
-                raise OverloadError(
-                    f"{len(self._jobs)} frame sets are waiting already.", remedy="Send fewer sets a second, or add workers."
-                )
-            self._jobs.append(job)
-            self._telemetry.queue(len(self._jobs))
+            evicted = None
+            if not newest_wins:
+                self._require_room(job.site_id)
+                evicted = self._queue.evict_for(job.site_id) if self._is_full() else None
+            superseded = self._queue.add(job, is_worker_free=self._idle > len(self._queue))
+            self._telemetry.queue(len(self._queue))
             self._changed.notify()
+        if superseded is not None:
+            self._refuse(superseded, Drop.SUPERSEDED, "a newer frame set of the site took its place.")
+        if evicted is not None:
+            self._refuse(evicted, Drop.QUEUE_FULL, "other sites had fewer frame sets waiting.")
         return job.future
 
-    async def submit(self, frame_set: FrameSet) -> SetResult:
-        """The result of a frame set, awaited; raises as :meth:`enqueue` and its future do."""
-        return await asyncio.wrap_future(self.enqueue(frame_set))
+    def require_room(self, site_id: str) -> None:
+        """Raise OverloadError, counted, if a posted set of a site would be refused now: before its frames are even read."""
+        with self._changed:
+            self._require_room(site_id)
+
+    async def submit(self, frame_set: FrameSet, *, newest_wins: bool = False) -> SetResult:
+        """The result of a frame set, awaited; takes and raises what :meth:`enqueue` and its future do."""
+        return await asyncio.wrap_future(self.enqueue(frame_set, newest_wins=newest_wins))
 
     def run(self, frame_set: FrameSet) -> SetResult:
         """The result of a frame set, for callers without an event loop; raises as :meth:`enqueue` and its future do."""
         return self.enqueue(frame_set).result()
 
-    def stop(self) -> None:
-        """Accept nothing more, finish what was accepted, and wait for the workers."""
+    def stop(self, timeout_s: float | None = None) -> int:
+        """Accept nothing more and finish what was accepted, for ``timeout_s`` seconds at most.
+
+        Gives how many frame sets were not finished by then: each is answered with an error and counted.
+        """
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
-        for thread in self._threads:
-            thread.join()
-
-    def _work(self) -> None:
-        while (job := self._next()) is not None:
-            if not self._is_dead(job):
-                self._telemetry.waited(time.monotonic() - job.queued_at)
-                self._run(job)
-
-    def _next(self) -> _Job | None:
+        running = self._pool.join(float("inf") if timeout_s is None else self._clock() + timeout_s)
+        self._ended.set()
+        self._watch.join()
         with self._changed:
-            while not self._jobs:
-                if self._stopping:
-                    return None
-                self._idle += 1
-                self._changed.wait()
-                self._idle -= 1
-            job = self._jobs.popleft()
-            self._telemetry.queue(len(self._jobs))
-            return job
+            waiting = self._queue.remove(lambda job: True)
+            self._telemetry.queue(0)
+        left = sum([self._refuse(job, Drop.UNFINISHED, "the service ended before it was done.") for job in waiting + running])
+        if left:
+            logger.error("%d frame sets were not finished in time", left)
+        return left
 
-    def _run(self, job: _Job) -> None:
-        if not job.future.set_running_or_notify_cancel():
-            self._telemetry.dropped(Drop.CANCELLED)
-            return
-        try:
-            result = self._runner.run(job.frame_set)
-        except QuadliftError as error:
-            job.future.set_exception(error)
-        except Exception:
-            # Whatever a network does must not end the worker, nor tell the caller about our insides.
-            logger.exception("A frame set of site '%s' failed", job.frame_set.site.id)
-            self._telemetry.dropped(Drop.FAILED)
-            job.future.set_exception(QuadliftError("the networks failed on this frame set.", remedy="See the service's log."))
-        else:
-            job.future.set_result(result)
+    def check(self) -> None:
+        """Replace workers that hang or died, and answer sets that have waited too long; done several times a second."""
+        self._pool.check(self._limit_s)
+        with self._changed:
+            overdue = self._queue.remove(self._is_dead)
+            self._telemetry.queue(len(self._queue))
+        self._bury(overdue)
 
-    def _is_dead(self, job: _Job) -> bool:
-        """Whether nobody waits for a job any more, or it has waited too long; if so, it is answered and counted."""
-        waited = time.monotonic() - job.queued_at
-        if not job.future.cancelled() and waited < self._deadline_s:
-            return False
-        if job.future.set_running_or_notify_cancel():
-            self._telemetry.dropped(Drop.DEADLINE)
-            job.future.set_exception(
-                OverloadError(f"the frame set waited {waited * 1e3:.0f} ms for a worker.", remedy="Send fewer sets a second.")
+    def _watch_over(self) -> None:
+        while not self._ended.wait(_CHECK_S):
+            try:
+                self.check()
+            except Exception:
+                # Most likely no thread could be started; the next look may find better times.
+                logger.exception("The workers could not be looked after")
+
+    def _limit_s(self, job: Job) -> float | None:
+        if self.run_limit_s is None:
+            return None
+        return self.run_limit_s * max(1.0, len(job.frame_set.frames) / _LIMIT_FRAMES)
+
+    def _is_full(self) -> bool:
+        # A job that an idle worker is about to take does not wait, so it takes no place.
+        return self._queue.posted >= self._queue_size + self._idle
+
+    def _require_room(self, site_id: str) -> None:
+        if self._is_full():
+            self._bury(self._queue.remove(self._is_dead))
+        # However many sites there are, each may have one set waiting: otherwise loud ones would be luckier.
+        if self._is_full() and self._queue.posted_of(site_id) and self._queue.heavier_than(site_id) is None:
+            self._telemetry.dropped(Drop.QUEUE_FULL)
+            raise OverloadError(
+                f"{self._queue.posted} frame sets are waiting already.", remedy="Send fewer sets a second, or add workers."
             )
-        else:
-            self._telemetry.dropped(Drop.CANCELLED)
-        return True
 
-    def _clear_dead(self) -> None:
-        self._jobs = deque(job for job in self._jobs if not self._is_dead(job))
+    def _next(self) -> Job | None:
+        """The next job worth running, for a worker; None when it may end."""
+        while True:
+            with self._changed:
+                while (job := self._queue.take()) is None:
+                    if self._stopping:
+                        return None
+                    self._idle += 1
+                    try:
+                        self._changed.wait()
+                    finally:
+                        self._idle -= 1
+                self._telemetry.queue(len(self._queue))
+            if self._is_dead(job):
+                self._bury([job])
+            elif job.future.set_running_or_notify_cancel():
+                self._telemetry.waited(self._clock() - job.queued_at)
+                return job
+            else:
+                self._telemetry.dropped(Drop.CANCELLED)
+
+    def _run(self, job: Job) -> None:
+        with on_behalf_of(job.request_id):
+            try:
+                result = self._runner.run(job.frame_set)
+            except QuadliftError as error:
+                job.fail(error)
+            except Exception:
+                # Whatever a network does must not end the worker, nor tell the caller about our insides.
+                logger.exception("A frame set of site '%s' failed", job.site_id, extra={"site": job.site_id})
+                if job.fail(QuadliftError("the networks failed on this frame set.", remedy="See the service's log.")):
+                    self._telemetry.dropped(Drop.FAILED)
+            else:
+                job.succeed(result)
+
+    def _is_dead(self, job: Job) -> bool:
+        """Whether nobody waits for a job any more, or it has waited too long."""
+        return job.future.cancelled() or self._clock() - job.queued_at >= self._deadline_s
+
+    def _bury(self, jobs: list[Job]) -> None:
+        for job in jobs:
+            waited_ms = 1e3 * (self._clock() - job.queued_at)
+            self._refuse(job, Drop.DEADLINE, f"the frame set waited {waited_ms:.0f} ms for a worker.")
+
+    def _refuse(self, job: Job, reason: Drop, message: str) -> bool:
+        """Answer a job that will not be run to its end, and count it by what ended it; False when it had an answer before."""
+        is_first = job.fail(OverloadError(message, remedy="Send fewer sets a second, or add workers."))
+        if is_first or job.future.cancelled():
+            self._telemetry.dropped(reason if is_first else Drop.CANCELLED)
+        return is_first

@@ -49,11 +49,19 @@ class Settings(BaseSettings):
     """Site files to load at start; each replaces a kept site of the same id."""
 
     workers: Annotated[int, Field(ge=1, le=256)] = Field(default_factory=usable_cores)
-    """Threads that run frame sets, each with one thread inside the networks. Default: the usable cores."""
+    """Threads that run frame sets. Default: the usable cores. ``quadlift tune`` measures what is best."""
+    intra_op_threads: Annotated[int, Field(ge=1, le=256)] = 1
+    """Threads inside the networks for each worker."""
     queue_size: Annotated[int, Field(ge=1)] = 16
-    """Frame sets that may wait for a worker; one more is answered 503."""
+    """Posted frame sets that may wait for a worker; one more is answered 503. Of every site one may wait in any case, and of
+    its camera streams one more, the newest."""
     deadline_ms: Annotated[float, Field(gt=0)] = 1000.0
     """A frame set that has waited this long for a worker is answered 503 instead of being run. Milliseconds."""
+    run_limit_ms: Annotated[float, Field(gt=0)] | None = None
+    """A set of up to four frames that runs for longer is answered 504, and its worker replaced as hung; larger sets may run
+    longer in proportion. Unset: three times what the warm-up took, at least 1500. Milliseconds."""
+    max_abandoned: Annotated[int, Field(ge=0, le=256)] = 4
+    """Threads that may hang while others take their place. One more, and the service is not ready until one comes back."""
     score_threshold: Annotated[float, Field(ge=0, le=1)] | None = None
     """Detections and boxes of a lower score are left out. Unset: the pipeline's own thresholds."""
     hard_mode: Literal["auto", "always", "never"] = "auto"
@@ -120,8 +128,16 @@ class Settings(BaseSettings):
 
     timeout_keep_alive_s: Annotated[int, Field(ge=1)] = 15
     """An idle connection is closed after this time. Seconds."""
-    timeout_shutdown_s: Annotated[int, Field(ge=0)] = 10
-    """Time for requests under way when the service is asked to stop. Seconds."""
+    drain_s: Annotated[float, Field(gt=0)] = 10.0
+    """Time to finish what was accepted when the service is asked to stop. Seconds."""
+    reader_stall_s: Annotated[float, Field(gt=0)] = 3.0
+    """A stream reader whose connection has taken nothing for this long is cut. Seconds."""
+    ping_s: Annotated[float, Field(gt=0)] = 20.0
+    """A WebSocket's peer is asked for a sign of life this often, and cut when it gives none for as long again. Seconds."""
+    log_format: Literal["text", "json"] = "text"
+    """Lines for people, or one JSON object a line."""
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    """The least important lines that are written."""
     limit_concurrency: Annotated[int, Field(ge=1)] = 512
     """Connections and requests at once; one more is answered 503."""
     ws_max_size: Annotated[int, Field(ge=1024)] = 16 * 2**20

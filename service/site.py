@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import tempfile
 from dataclasses import dataclass, field, replace
@@ -15,6 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from service.errors import CalibrationError, NotFoundError
 from service.geometry.camera import Camera
 from service.geometry.ground import MAX_NODES, Ground, GroundGrid, GroundPlane
+
+logger = logging.getLogger(__name__)
 
 ID_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 """Ids of sites and cameras: safe in URLs, file names and form fields."""
@@ -265,3 +268,17 @@ def save_site(site: Site, path: Path) -> None:
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Let the names in a folder outlive a loss of power, where the system can do that."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        # Windows and some network file systems know no such thing; the change itself is made already.
+        logger.debug("The folder %s cannot be synchronised: %s", folder, error)

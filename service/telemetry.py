@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from enum import StrEnum
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
@@ -19,6 +19,10 @@ class Drop(StrEnum):
     """A frame set waited too long for a worker."""
     STOPPING = "stopping"
     """A frame set came while the service was stopping."""
+    UNFINISHED = "unfinished"
+    """A frame set was accepted, and not done when the service's time to stop was over."""
+    HUNG = "hung"
+    """The networks hung on a frame set."""
     CANCELLED = "cancelled"
     """A frame set's sender went away before it was run."""
     FAILED = "failed"
@@ -27,6 +31,8 @@ class Drop(StrEnum):
     """A frame set was answered, but a later one had been tracked and published already."""
     SLOW_READER = "slow_reader"
     """A stream message was replaced by a newer one before its reader took it."""
+    STALLED_READER = "stalled_reader"
+    """A stream reader that took nothing for too long was cut."""
     NOT_FINITE = "not_finite"
     """A box held a number that is not finite."""
     SUPERSEDED = "superseded"
@@ -45,6 +51,15 @@ class Drop(StrEnum):
     """More frames of one camera, or more bytes of one site, were waiting for their set than may."""
     FRAME_LEFT = "frame_camera_left"
     """A frame's camera or site went before its set did."""
+
+
+class Restart(StrEnum):
+    """Why a worker was replaced."""
+
+    HUNG = "hung"
+    """A frame set had run for too long; the thread is abandoned."""
+    DIED = "died"
+    """Its thread ended."""
 
 
 class Telemetry:
@@ -80,10 +95,21 @@ class Telemetry:
             buckets=_SECONDS,
             registry=self.registry,
         )
+        self._workers = Gauge("quadlift_workers", "Workers that do not hang.", registry=self.registry)
+        self._abandoned = Gauge("quadlift_abandoned_workers", "Threads that hang in the networks.", registry=self.registry)
+        self._restarts = Counter("quadlift_worker_restarts", "Workers replaced, by reason.", ["reason"], registry=self.registry)
+        self._lag = Histogram(
+            "quadlift_event_loop_lag_seconds",
+            "How much later than it should the event loop ran a timer, sampled.",
+            buckets=_SECONDS,
+            registry=self.registry,
+        )
         self._ready = Gauge("quadlift_ready", "1 when the service answers frame sets.", registry=self.registry)
         for reason in Drop:
             # A counter that is there from the start can be alerted on.
             self._dropped.labels(reason.value)
+        for cause in Restart:
+            self._restarts.labels(cause.value)
 
     def request(self, route: str, status: int) -> None:
         """Count an answered HTTP request; ``route`` is the template, so that ids do not multiply the series."""
@@ -127,9 +153,22 @@ class Telemetry:
         """Note how far a frame lies from its set's capture time."""
         self._skews.observe(abs(milliseconds) / 1e3)
 
-    def ready(self, is_ready: bool) -> None:
-        """Note whether the service is ready."""
-        self._ready.set(int(is_ready))
+    def workers(self, working: int, abandoned: int) -> None:
+        """Note how many workers there are that do not hang, and how many threads do."""
+        self._workers.set(working)
+        self._abandoned.set(abandoned)
+
+    def restarted(self, reason: Restart) -> None:
+        """Count a worker that was replaced."""
+        self._restarts.labels(reason.value).inc()
+
+    def lag(self, seconds: float) -> None:
+        """Note how late the event loop ran a timer."""
+        self._lag.observe(max(0.0, seconds))
+
+    def ready(self, is_ready: Callable[[], bool]) -> None:
+        """Ask ``is_ready`` whether frame sets are answered, whenever the metrics are read."""
+        self._ready.set_function(lambda: float(is_ready()))
 
     def forget_site(self, site: str) -> None:
         """Drop a site's series, so that sites which come and go do not grow the page for ever."""

@@ -16,7 +16,9 @@ from service.api.errors import install_error_handlers
 from service.api.feeds import Feed, Feeds
 from service.api.guard import Guard
 from service.api.live import LiveSites, TrackerFactory, default_tracker
+from service.api.loop_lag import watch_loop
 from service.api.recent import RecentFrames
+from service.api.request_ids import RequestIds
 from service.api.state import Service
 from service.errors import CalibrationError
 from service.scheduler import FrameSetRunner, Scheduler
@@ -55,6 +57,7 @@ def create_app(
             workers=settings.workers,
             queue_size=settings.queue_size,
             deadline_s=settings.deadline_ms / 1e3,
+            max_abandoned=settings.max_abandoned,
             telemetry=telemetry,
         )
         live = LiveSites(
@@ -65,27 +68,30 @@ def create_app(
             return Feed(
                 lambda: store.get(site_id),
                 lambda: live.site(site_id).next_sequence(),
-                lambda frame_set: detect.answer(service, frame_set),
+                lambda frame_set: detect.answer(service, frame_set, newest_wins=True),
                 telemetry,
                 settings.sync,
-                settings.workers + 1,
+                2 * settings.workers + 2,
             )
 
         feeds = Feeds(make_feed, telemetry, max_connections=settings.ingest_max_connections)
         service = Service(settings, telemetry, store, scheduler, live, feeds, RecentFrames(settings.viewer_max_bytes))
         app.state.service = service
         warming = asyncio.create_task(service.warm_up(runner))
+        watching = asyncio.create_task(watch_loop(telemetry))
         try:
             yield
         finally:
-            await feeds.stop()
-            await asyncio.to_thread(service.stop)
-            await warming
+            await service.drain()
+            warming.cancel()
+            watching.cancel()
+            await asyncio.gather(warming, watching, return_exceptions=True)
 
     app = FastAPI(title="Quadlift", version=__version__, description=_DESCRIPTION, lifespan=lifespan, redoc_url=None)
     app.add_middleware(Access, tokens=tokens, allowed_origins=settings.allowed_origins)
-    # The one added last is the outermost: refusals are counted too.
-    app.add_middleware(Guard, telemetry=telemetry)
+    # The one added last is the outermost: refusals are counted too, and all have an id.
+    app.add_middleware(Guard, telemetry=telemetry, is_stopping=lambda: app.state.service.phase == "stopping")
+    app.add_middleware(RequestIds)
     install_error_handlers(app)
     for room in (detect, sites, stream, ingest, health):
         app.include_router(room.router)
@@ -102,7 +108,8 @@ def default_pipeline(settings: Settings) -> FrameSetRunner:
     options = PipelineSettings(hard_mode=settings.hard_mode)
     if (threshold := settings.score_threshold) is not None:
         options = replace(options, score_threshold=threshold, min_fused_score=threshold)
-    return Pipeline(load_pack(settings.pack, provider=settings.provider), options)
+    pack = load_pack(settings.pack, provider=settings.provider, intra_op_threads=settings.intra_op_threads)
+    return Pipeline(pack, options)
 
 
 def open_store(settings: Settings) -> SitesStore:
@@ -110,7 +117,8 @@ def open_store(settings: Settings) -> SitesStore:
     store = SitesStore(settings.data_dir, max_sites=settings.max_sites, max_cameras=settings.max_cameras)
     for path in settings.sites:
         try:
-            store.put(load_site(path))
+            # A disk that became read-only must not keep a restarted service from its work.
+            store.put(load_site(path), must_keep=False)
         except CalibrationError as error:
             raise CalibrationError(f"{error.field}: {error.message}", field=str(path), remedy=error.remedy) from error
     return store

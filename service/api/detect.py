@@ -42,7 +42,7 @@ _REQUEST_BODY: dict[str, Any] = {
 @router.post(
     "/detect",
     openapi_extra=_REQUEST_BODY,
-    responses={200: {"model": Detections}, **{code: {"model": ErrorMessage} for code in (404, 408, 413, 422, 503)}},
+    responses={200: {"model": Detections}, **{code: {"model": ErrorMessage} for code in (404, 408, 413, 422, 503, 504)}},
 )
 async def detect(
     request: Request,
@@ -58,6 +58,8 @@ async def detect(
     arrived_at_ns = time.time_ns()
     known_site = service.store.get(site)
     service.require_ready()
+    # Refusing before the frames are read leaves the processor to the sets that were accepted.
+    service.scheduler.require_room(site)
     body = await read_body(request, service.settings.max_body_bytes, service.settings.body_receive_s)
     frames, captured_at_ns = await asyncio.to_thread(
         frames_from_form, body, request.headers.get("content-type"), known_site, service.settings.frame_limits, arrived_at_ns
@@ -67,11 +69,14 @@ async def detect(
     return Response(content, media_type="application/json")
 
 
-async def answer(service: Service, frame_set: FrameSet, *, per_camera: bool = False) -> bytes:
-    """Run a frame set, publish its message if the site's stream runs, and give the message as JSON."""
+async def answer(service: Service, frame_set: FrameSet, *, per_camera: bool = False, newest_wins: bool = False) -> bytes:
+    """Run a frame set, publish its message if the site's stream runs, and give the message as JSON.
+
+    newest_wins: while it waits for a worker, a newer set of its site may take its place (OverloadError).
+    """
     live = service.live.site(frame_set.site.id)
     with live.passage(frame_set.captured_at_ns) as passage:
-        result, not_finite = finite_only(await service.scheduler.submit(frame_set))
+        result, not_finite = finite_only(await service.scheduler.submit(frame_set, newest_wins=newest_wins))
         if not_finite:
             service.telemetry.dropped(Drop.NOT_FINITE, not_finite)
         tracked, track_ms = await live.track(passage, result)

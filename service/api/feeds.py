@@ -23,8 +23,8 @@ RunSet = Callable[[FrameSet], Awaitable[object]]
 class Feed:
     """One site's connections, the frames that wait for their set, and the sets under way. For the event loop only.
 
-    At most ``in_flight`` sets are under way and one waits; a newer one takes its place, so that no site's camera streams
-    fill the scheduler's queue.
+    At most ``in_flight`` sets are under way (the scheduler runs some, holds the newest, and some are on their way out) and one
+    waits here; a newer one takes its place.
     """
 
     def __init__(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import time
+from collections.abc import Callable
 
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -19,21 +21,25 @@ _UNMATCHED = "unmatched"
 class Guard:
     """ASGI middleware. An exception that reaches it is logged with its traceback; its caller learns only that it was one."""
 
-    def __init__(self, app: ASGIApp, telemetry: Telemetry) -> None:
+    def __init__(self, app: ASGIApp, telemetry: Telemetry, is_stopping: Callable[[], bool]) -> None:
+        """is_stopping: asks whether callers should be told to connect anew for their next request."""
         self._app = app
         self._telemetry = telemetry
+        self._is_stopping = is_stopping
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        status = 0
+        status, began = 0, time.monotonic()
 
         async def watch(message: Message) -> None:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
+                if self._is_stopping():
+                    message["headers"] = [*message.get("headers", ()), (b"connection", b"close")]
             await send(message)
 
         try:
@@ -48,3 +54,4 @@ class Guard:
             await error_response(INTERNAL)(scope, receive, watch)
         finally:
             self._telemetry.request(getattr(scope.get("route"), "path", _UNMATCHED), status)
+            logger.debug("%s %s: %d after %.1f ms", scope["method"], scope["path"], status, 1e3 * (time.monotonic() - began))

@@ -9,6 +9,7 @@ from starlette.responses import Response
 
 from service import __version__
 from service.api.state import ServiceDep
+from service.errors import OverloadError
 from service.schemas import ErrorMessage, Health
 
 router = APIRouter(tags=["health"])
@@ -22,8 +23,10 @@ async def live() -> Response:
 
 @router.get("/health/ready", responses={200: {"model": Health}, 503: {"model": ErrorMessage}})
 async def ready(service: ServiceDep) -> Response:
-    """The networks are warm and frame sets are answered; 503 before that, and while stopping."""
-    service.require_ready()
+    """The networks are warm and all workers do their work; 503 before that, while stopping, and while too many threads hang."""
+    trouble = service.trouble()
+    if trouble is not None:
+        raise OverloadError(trouble, retry_after_s=2, remedy="Wait; if it stays, see the service's log and start it anew.")
     return _health(Health(status="ready", version=__version__))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 
 from fastapi import APIRouter, WebSocket
 from starlette.websockets import WebSocketDisconnect
@@ -11,14 +12,19 @@ from service.api.errors import error_response, error_text
 from service.api.feeds import Feed
 from service.api.ingest_message import IngestMessage, parse_message
 from service.api.state import Service, ServiceDep
-from service.errors import InputError, NotFoundError, QuadliftError
+from service.api.wire import wire_of
+from service.errors import InputError, NotFoundError, OverloadError, QuadliftError
 from service.frames import EncodedFrame, RefusedFrame, check_frame
 from service.telemetry import Drop
+
+logger = logging.getLogger(__name__)
 
 router = APIRouter()
 
 _POLICY_VIOLATION = 1008
 _GOING_AWAY = 1001
+_FAREWELL_S = 2.0
+"""Time to tell a sender why its connection ends."""
 
 
 class _Cut(Exception):
@@ -41,10 +47,16 @@ async def ingest(websocket: WebSocket, site: str, service: ServiceDep) -> None:
         await websocket.send_denial_response(error_response(error))
         return
     connection = Connection(websocket, site, service, feed)
+    service.ingests.add(connection)
     try:
         await websocket.accept()
+        logger.info("a camera stream opens", extra={"site": site})
         await connection.serve()
     finally:
+        logger.info(
+            "a camera stream ends; its cameras: %s", ", ".join(sorted(connection.cameras)) or "none", extra={"site": site}
+        )
+        service.ingests.discard(connection)
         feed.cameras_leave(connection.cameras)
         service.feeds.leave(site, feed)
 
@@ -60,18 +72,33 @@ class Connection:
         self._service = service
         self._feed = feed
         self._errors = 0
+        self._camera_id: str | None = None
+        """The camera of the message at hand, as soon as it is known."""
+        self._leaving = False
+        self._receiving: asyncio.Timeout | None = None
+
+    def go_away(self) -> None:
+        """The service stops: take no message more and say so."""
+        self._leaving = True
+        if self._receiving is not None:
+            self._receiving.reschedule(asyncio.get_running_loop().time())
 
     async def serve(self) -> None:
-        """Take messages until the sender goes, is too slow, or sends too much that is wrong."""
+        """Take messages until the sender goes, is too slow, or sends too much that is wrong, or the service stops."""
         limit_s = self._service.settings.ingest_receive_s
         try:
-            while True:
+            while not self._leaving:
                 try:
-                    async with asyncio.timeout(limit_s):
+                    async with asyncio.timeout(limit_s) as self._receiving:
                         message = await self._receive()
                 except TimeoutError:
+                    if self._leaving:
+                        break
                     raise _Cut(_POLICY_VIOLATION, _too_slow(limit_s)) from None
+                finally:
+                    self._receiving = None
                 await self._take(message)
+            raise _Cut(_GOING_AWAY, OverloadError("the service is stopping.", remedy="Connect again when it has started anew."))
         except WebSocketDisconnect:
             return
         except _Cut as cut:
@@ -91,6 +118,9 @@ class Connection:
         except InputError as error:
             self._service.telemetry.dropped(Drop.FRAME_REFUSED)
             self._errors += 1
+            if self._errors == 1:
+                # The first of a row: a camera that sends rubbish must not fill the log.
+                logger.warning("a frame is refused: %s", error, extra={"site": self._site_id, "camera": self._camera_id})
             if isinstance(error, NotFoundError) and error.field == "site":
                 raise _Cut(_GOING_AWAY, error) from None
             if self._errors >= self._service.settings.ingest_max_errors:
@@ -101,6 +131,7 @@ class Connection:
 
     def _accept(self, message: bytes | None) -> None:
         """Check a message and hand its frame on. Raises InputError and its kinds."""
+        self._camera_id = None
         settings = self._service.settings
         if self._feed.is_closed:
             raise NotFoundError("the site was deleted.", field="site", remedy="Connect again if it has come back.")
@@ -110,6 +141,7 @@ class Connection:
             message, max_header_bytes=settings.ingest_max_header_bytes, max_frame_bytes=settings.max_frame_bytes
         )
         camera = self._service.store.get(self._site_id).camera(parsed.camera_id)
+        self._camera_id = camera.id
         if camera.id not in self.cameras:
             self.cameras.add(camera.id)
             self._feed.camera_joins(camera.id)
@@ -134,10 +166,11 @@ class Connection:
             await self._websocket.close(cut.code, cut.error.message[:100])
 
         try:
-            await asyncio.wait_for(say_and_close(), limit_s)
+            await asyncio.wait_for(say_and_close(), min(limit_s, _FAREWELL_S))
         except (TimeoutError, WebSocketDisconnect, RuntimeError):
-            # It is gone or does not listen; leaving the endpoint breaks the connection.
-            return
+            # It is gone or does not listen.
+            if (wire := wire_of(self._websocket)) is not None:
+                wire.abort()
 
 
 def _frame(message: IngestMessage) -> EncodedFrame:

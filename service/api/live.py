@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from service.tracking import TrackedBoxes
 
 Format = Literal["json", "msgpack"]
+_LEAVE_POLL_S = 0.02
 
 
 class SiteTracker(Protocol):
@@ -40,7 +41,8 @@ class Reader:
         self.format: Format = format
         self._telemetry = telemetry
         self._message: Encoded | None = None
-        self._closed = False
+        self.end_reason: str | None = None
+        """Why the stream ended; None while it runs."""
         self._changed = asyncio.Event()
 
     def offer(self, message: Encoded) -> None:
@@ -50,18 +52,17 @@ class Reader:
         self._message = message
         self._changed.set()
 
-    def close(self) -> None:
-        """End the stream: :meth:`take` gives None from now on."""
-        self._closed = True
+    def close(self, reason: str) -> None:
+        """End the stream: after a message that waits, :meth:`take` gives None from now on."""
+        self.end_reason = reason
         self._changed.set()
 
     async def take(self) -> Encoded | None:
         """The newest message, as soon as there is one; None when the stream has ended."""
         await self._changed.wait()
-        if self._closed:
-            return None
         message, self._message = self._message, None
-        self._changed.clear()
+        if self.end_reason is None:
+            self._changed.clear()
         return message
 
 
@@ -126,11 +127,21 @@ class LiveSite:
         if not self._closed:
             self._telemetry.readers(self.site_id, len(self._readers))
 
-    def close(self) -> None:
-        """End the stream for every reader; the site is gone."""
+    def close(self, reason: str) -> None:
+        """End the stream for every reader."""
         self._closed = True
         for reader in self._readers:
-            reader.close()
+            reader.close(reason)
+
+    async def settle(self) -> None:
+        """Wait until no frame set is under way."""
+        while self._passages:
+            await self._passages[0].over.wait()
+
+    async def emptied(self) -> None:
+        """Wait until every reader has left."""
+        while self._readers:
+            await asyncio.sleep(_LEAVE_POLL_S)
 
     @contextmanager
     def passage(self, captured_at_ns: int) -> Iterator[Passage]:
@@ -192,7 +203,17 @@ class LiveSites:
         """End a site's stream and drop its state."""
         live = self._sites.pop(site_id, None)
         if live is not None:
-            live.close()
+            live.close("the site was deleted")
+
+    async def stop(self) -> None:
+        """Wait for the frame sets under way, then end every stream and wait until its readers have left."""
+        sites = list(self._sites.values())
+        for live in sites:
+            await live.settle()
+        for live in sites:
+            live.close("the service is stopping")
+        for live in sites:
+            await live.emptied()
 
 
 def default_tracker() -> SiteTracker:

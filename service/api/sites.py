@@ -18,6 +18,7 @@ from service.schemas import ErrorMessage
 from service.site import CameraModel, Site, SiteModel, parse_site, site_document
 
 router = APIRouter(prefix="/sites", tags=["sites"], responses={code: {"model": ErrorMessage} for code in (404, 408, 413, 422)})
+_NOT_KEPT: dict[int | str, dict[str, Any]] = {507: {"model": ErrorMessage, "description": "The data folder cannot be written"}}
 
 
 def _json(content: Any, status: int = 200) -> Response:
@@ -40,7 +41,9 @@ async def get_site(site: str, service: ServiceDep) -> Response:
     return _json(site_document(service.store.get(site)))
 
 
-@router.put("/{site}", openapi_extra=_body_of(SiteModel), responses={200: {"model": SiteModel}, 201: {"model": SiteModel}})
+@router.put(
+    "/{site}", openapi_extra=_body_of(SiteModel), responses={200: {"model": SiteModel}, 201: {"model": SiteModel}, **_NOT_KEPT}
+)
 async def put_site(site: str, request: Request, service: ServiceDep) -> Response:
     """Add a site (201) or replace it (200); answers with the site as kept. The stream, if it runs, goes on."""
     body = await read_body(request, service.settings.max_body_bytes, service.settings.body_receive_s)
@@ -49,7 +52,7 @@ async def put_site(site: str, request: Request, service: ServiceDep) -> Response
     return _json(site_document(new), 201 if created else 200)
 
 
-@router.delete("/{site}", status_code=204)
+@router.delete("/{site}", status_code=204, responses=_NOT_KEPT)
 async def delete_site(site: str, service: ServiceDep) -> Response:
     """Drop a site and end its streams."""
     await asyncio.to_thread(service.store.delete, site)
@@ -69,7 +72,7 @@ async def get_camera(site: str, camera: str, service: ServiceDep) -> Response:
 @router.put(
     "/{site}/cameras/{camera}",
     openapi_extra=_body_of(CameraModel),
-    responses={200: {"model": CameraModel}, 201: {"model": CameraModel}},
+    responses={200: {"model": CameraModel}, 201: {"model": CameraModel}, **_NOT_KEPT},
 )
 async def put_camera(site: str, camera: str, request: Request, service: ServiceDep) -> Response:
     """Let a camera join a site (201), or replace its calibration (200), while the site runs."""
@@ -80,7 +83,7 @@ async def put_camera(site: str, camera: str, request: Request, service: ServiceD
     return _json(_camera_document(new), 201 if created else 200)
 
 
-@router.delete("/{site}/cameras/{camera}", status_code=204)
+@router.delete("/{site}/cameras/{camera}", status_code=204, responses=_NOT_KEPT)
 async def delete_camera(site: str, camera: str, service: ServiceDep) -> Response:
     """Let a camera leave a site while the site runs."""
     await asyncio.to_thread(service.store.delete_camera, site, camera)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from typing import Literal, cast
 
 from fastapi import APIRouter, WebSocket
@@ -10,13 +11,22 @@ from starlette.websockets import WebSocketDisconnect
 
 from service.api.errors import error_response
 from service.api.live import Format, Reader
+from service.api.messages import Encoded
 from service.api.state import ServiceDep
+from service.api.wire import wire_of
 from service.errors import InputError, QuadliftError
+from service.telemetry import Drop
+
+logger = logging.getLogger(__name__)
 
 router = APIRouter()
 
 _GOING_AWAY: Literal[1001] = 1001
 _FORMATS = ("json", "msgpack")
+
+
+class _Stalled(Exception):
+    """The reader's connection has taken nothing for too long."""
 
 
 @router.websocket("/stream/{site}")
@@ -29,16 +39,27 @@ async def stream(websocket: WebSocket, site: str, service: ServiceDep) -> None:
     except QuadliftError as error:
         await websocket.send_denial_response(error_response(error))
         return
+    wire = wire_of(websocket)
+    if wire is not None:
+        wire.limit_buffers()
     try:
         await websocket.accept()
-        await _serve(websocket, reader)
+        logger.info("a reader joins", extra={"site": site})
+        await _serve(websocket, reader, service.settings.reader_stall_s)
+    except _Stalled:
+        service.telemetry.dropped(Drop.STALLED_READER)
+        logger.warning("a reader that takes nothing is cut", extra={"site": site})
+        if wire is not None:
+            wire.abort()
+    else:
+        logger.info("a reader leaves", extra={"site": site})
     finally:
         live.leave(reader)
 
 
-async def _serve(websocket: WebSocket, reader: Reader) -> None:
-    """Send until the client goes or the stream ends, whichever is first."""
-    tasks = {asyncio.create_task(_send_all(websocket, reader)), asyncio.create_task(_until_gone(websocket))}
+async def _serve(websocket: WebSocket, reader: Reader, stall_s: float) -> None:
+    """Send until the client goes or the stream ends, whichever is first. Raises _Stalled."""
+    tasks = {asyncio.create_task(_send_all(websocket, reader, stall_s)), asyncio.create_task(_until_gone(websocket))}
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     finally:
@@ -50,13 +71,22 @@ async def _serve(websocket: WebSocket, reader: Reader) -> None:
             raise outcome
 
 
-async def _send_all(websocket: WebSocket, reader: Reader) -> None:
-    while (message := await reader.take()) is not None:
-        if reader.format == "json":
-            await websocket.send_text(message.json.decode())
-        elif message.msgpack is not None:
-            await websocket.send_bytes(message.msgpack)
-    await websocket.close(_GOING_AWAY, "the site was deleted")
+async def _send_all(websocket: WebSocket, reader: Reader, stall_s: float) -> None:
+    try:
+        while (message := await reader.take()) is not None:
+            async with asyncio.timeout(stall_s):
+                await _send(websocket, reader.format, message)
+        async with asyncio.timeout(stall_s):
+            await websocket.close(_GOING_AWAY, reader.end_reason)
+    except TimeoutError:
+        raise _Stalled from None
+
+
+async def _send(websocket: WebSocket, format: Format, message: Encoded) -> None:
+    if format == "json":
+        await websocket.send_text(message.json.decode())
+    elif message.msgpack is not None:
+        await websocket.send_bytes(message.msgpack)
 
 
 async def _until_gone(websocket: WebSocket) -> None:

@@ -14,7 +14,8 @@ import typer
 from typer.testing import CliRunner
 
 from service import __version__
-from service.cli import add_commands, app, server_config
+from service.api.server import server_config
+from service.cli import add_commands, app
 from service.geometry.camera import Camera
 from service.geometry.transforms import pole_camera_pose
 from service.settings import Settings

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from service.errors import CalibrationError, NotFoundError, TooLargeError
+from service.errors import CalibrationError, NotFoundError, StorageError, TooLargeError
 from service.geometry.camera import Camera
 from service.site import Site
 from service.sites_store import SitesStore
@@ -62,19 +64,52 @@ def test_limits_leave_the_store_as_it_was() -> None:
     assert len(store.get("demo").cameras) == 1
 
 
-def test_a_failed_write_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def full(*_: object, **__: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def read_only(*_: object, **__: object) -> None:
+    raise OSError(errno.EROFS, "Read-only file system")
+
+
+FAULTS = [("os.fsync", full), ("json.dump", full), ("tempfile.mkstemp", read_only), ("pathlib.Path.replace", read_only)]
+
+
+@pytest.mark.parametrize(("call", "fault"), FAULTS)
+def test_a_failed_write_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str, fault: Callable[..., None]
+) -> None:
     store = SitesStore(tmp_path)
     store.put(Site("demo"))
-
-    def full(_: int) -> None:
-        raise OSError("disk full")
-
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError, match="disk full"):
+    monkeypatch.setattr(call, fault)
+    with pytest.raises(StorageError) as caught:
         store.put_camera("demo", camera("north"))
+    assert (caught.value.status, caught.value.field) == (507, "data_dir")
+    assert "demo" in str(caught.value)
+    monkeypatch.undo()
     assert store.get("demo").cameras == ()
     assert SitesStore(tmp_path).get("demo").cameras == ()
     assert [path.name for path in tmp_path.iterdir()] == ["demo.json"]
+    assert store.put_camera("demo", camera("north"))
+
+
+def test_a_site_whose_file_stays_is_not_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = SitesStore(tmp_path)
+    store.put(Site("demo"))
+    monkeypatch.setattr("pathlib.Path.unlink", read_only)
+    with pytest.raises(StorageError, match="Read-only"):
+        store.delete("demo")
+    assert ids(store) == ["demo"]
+
+
+def test_at_the_start_a_site_may_live_in_memory_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    store = SitesStore(tmp_path)
+    monkeypatch.setattr("tempfile.mkstemp", read_only)
+    assert store.put(Site("demo"), must_keep=False)
+    assert ids(store) == ["demo"]
+    assert "in memory only" in caplog.text
 
 
 def test_a_damaged_file_is_named(tmp_path: Path) -> None:

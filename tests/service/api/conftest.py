@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -13,11 +14,11 @@ import httpx
 import numpy as np
 import pytest
 import simplejpeg
-import uvicorn
 from fastapi import FastAPI
 from websockets.sync.client import ClientConnection, connect
 
 from service.api.app import create_app
+from service.api.server import Server, server_config
 from service.errors import FrameError
 from service.frames import FrameSet, decode
 from service.geometry.boxes import Boxes
@@ -124,10 +125,10 @@ def wait_until(condition: Callable[[], bool]) -> None:
 class ServiceClient(httpx.Client):
     """A client of a service that really listens, in a thread of the test's process."""
 
-    def __init__(self, app: FastAPI, headers: dict[str, str] | None = None) -> None:
+    def __init__(self, settings: Settings, app: FastAPI, headers: dict[str, str] | None = None) -> None:
         self.app = app
-        config = uvicorn.Config(app, port=0, log_config=None, timeout_graceful_shutdown=2)
-        self._server = uvicorn.Server(config)
+        config = server_config(settings, app)
+        self._server = Server(config, lambda: app.state.service.drain(), settings.drain_s)
         self._thread = threading.Thread(target=self._server.run)
         self._thread.start()
         wait_until(lambda: self._server.started or not self._thread.is_alive())
@@ -138,11 +139,20 @@ class ServiceClient(httpx.Client):
         """Subscribe to a stream."""
         return connect(f"ws://{self.address}{path}", open_timeout=10, compression=None)
 
-    def shut_down(self) -> None:
-        self.close()
+    def ask_to_stop(self) -> None:
+        """What SIGTERM does."""
         self._server.should_exit = True
+
+    def join(self) -> None:
+        """Wait until the service has stopped."""
         self._thread.join(10)
         assert not self._thread.is_alive(), "the service did not stop"
+
+    def shut_down(self) -> None:
+        """Stop the service, if it has not."""
+        self.close()
+        self.ask_to_stop()
+        self.join()
 
 
 @pytest.fixture
@@ -151,7 +161,8 @@ def start(pipeline: FakePipeline) -> Iterator[Callable[..., ServiceClient]]:
     clients: list[ServiceClient] = []
 
     def build(ready: bool = True, headers: dict[str, str] | None = None, **options: Any) -> ServiceClient:
-        client = ServiceClient(create_app(Settings(workers=2, **options), lambda _: pipeline), headers)
+        settings = Settings(**{"workers": 2, "port": 0, "drain_s": 2, "run_limit_ms": 60_000, **options})
+        client = ServiceClient(settings, create_app(settings, lambda _: pipeline), headers)
         clients.append(client)
         assert client.put("/sites/demo", json=site_body()).status_code == 201
         if ready:
@@ -171,10 +182,25 @@ def client(start: Callable[..., ServiceClient]) -> ServiceClient:
     return start()
 
 
+def open_and_never_read(address: str) -> socket.socket:
+    """A subscriber with small buffers that takes no byte after the handshake."""
+    host, port = address.split(":")
+    raw = socket.socket()
+    raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    raw.connect((host, int(port)))
+    raw.sendall(
+        f"GET /stream/demo HTTP/1.1\r\nHost: {address}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
+    )
+    assert b"101" in raw.recv(16)
+    return raw
+
+
 class Tools:
     """What tests of the API use; a fixture, since test modules import nothing from each other."""
 
     jpeg = staticmethod(jpeg)
+    open_and_never_read = staticmethod(open_and_never_read)
     png = staticmethod(png)
     one_box = staticmethod(one_box)
     camera_document = staticmethod(camera_document)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import re
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,30 @@ def test_a_failed_warm_up_never_becomes_ready(
     tools.wait_until(lambda: "could not" in client.get("/health/ready").text)
     assert "secret" not in tools.error(client.get("/health/ready"), 503)["message"]
     assert "secret" in caplog.text
+
+
+def test_readiness_tells_of_threads_that_hang(start: Callable[..., Any], pipeline: Any, tools: Any) -> None:
+    """With no thread to spare: the caller is answered, and all is well again when the thread is back."""
+    gate = pipeline.gates.setdefault(1_800_000_000 * 10**9, threading.Event())
+    client = start(run_limit_ms=50, max_abandoned=0)
+    hung = tools.error(tools.detect(client, data={"captured_at": "2027-01-15T08:00:00Z"}), 504)
+    assert hung["code"] == "run_timeout"
+    assert "QUADLIFT_RUN_LIMIT_MS" in hung["remedy"]
+    assert "1 of 2 workers hang" in tools.error(client.get("/health/ready"), 503)["message"]
+    assert client.get("/health/live").status_code == 200
+    metrics = client.get("/metrics").text
+    for line in ("quadlift_ready 0.0", "quadlift_workers 1.0", "quadlift_abandoned_workers 1.0"):
+        assert f"\n{line}\n" in metrics
+    gate.set()
+    tools.wait_until(lambda: client.get("/health/ready").status_code == 200)
+    metrics = client.get("/metrics").text
+    for line in (
+        "quadlift_ready 1.0",
+        "quadlift_workers 2.0",
+        'quadlift_worker_restarts_total{reason="hung"} 1.0',
+        'quadlift_dropped_total{reason="hung"} 1.0',
+    ):
+        assert f"\n{line}\n" in metrics
 
 
 def test_a_broken_pack_stops_the_start() -> None:

@@ -89,6 +89,20 @@ def test_a_camera_that_stays_away_is_missing_and_one_that_sends_rubbish_is_bad(c
     assert drops(client) == {"frame_refused": 1}
 
 
+def test_of_refused_frames_in_a_row_one_is_logged_with_its_camera(
+    client: Any, tools: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    with open_ingest(client) as socket:
+        for data in (b"rubbish", b"rubbish", tools.jpeg(), b"rubbish"):
+            socket.send(message("east", time.time_ns(), data))
+        socket.send(b"?")
+        for _ in range(4):
+            error_of(socket)
+    lines = [record for record in caplog.records if "refused" in record.getMessage()]
+    assert [(record.site, record.camera) for record in lines] == [("demo", "east")] * 2  # type: ignore[attr-defined]
+    assert drops(client)["frame_refused"] == 4
+
+
 def test_a_late_frame_stands_in_as_stale(start: Callable[..., Any], tools: Any) -> None:
     client = start(sync_stale_ms=150, sync_clock_ms=60_000)
     with client.stream() as stream, open_ingest(client) as socket:
@@ -196,14 +210,14 @@ def test_under_overload_the_newest_set_wins_and_every_frame_is_counted(client: A
         tools.wait_until(lambda: pipeline.runs == 2)
         for i in range(3, 10):
             socket.send(message("north", begin + i * 100_000_000, tools.jpeg()))
-        tools.wait_until(lambda: drops(client).get("superseded") == 6)
+        tools.wait_until(lambda: drops(client).get("superseded") == 7)
         for gate in gates:
             gate.set()
         got = receive(stream)
         while got.sequence != 10:
             got = receive(stream)
-    assert pipeline.runs == 4
-    assert drops(client)["superseded"] == 6
+    assert pipeline.runs == 3
+    assert drops(client)["superseded"] == 7
 
 
 def test_networks_that_fail_on_a_set_fail_on_it_alone(client: Any, pipeline: Any, tools: Any) -> None:

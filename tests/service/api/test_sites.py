@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -140,3 +141,28 @@ def test_frames_are_bounded_in_bytes_and_can_be_off(start: Callable[..., Any], t
     off = start(viewer=False)
     tools.detect(off)
     assert "QUADLIFT_VIEWER" in tools.error(off.get("/sites/demo/frames/north"), 404)["remedy"]
+
+
+def test_a_full_disk_stops_changes_and_nothing_else(
+    start: Callable[..., Any], tools: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client = start(data_dir=tmp_path)
+    before = (tmp_path / "demo.json").read_bytes()
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    for change in (
+        client.put("/sites/demo", json=tools.site_body("north")),
+        client.put("/sites/new", json={**tools.site_body(), "id": "new"}),
+        client.delete("/sites/demo/cameras/north"),
+    ):
+        error = tools.error(change, 507)
+        assert (error["code"], error["field"]) == ("storage", "data_dir")
+        assert "No space left" in error["message"]
+        assert error["remedy"]
+    assert tools.detect(client).json()["cameras"].keys() == {"north", "east"}
+    assert client.get("/health/ready").status_code == 200
+    assert [path.name for path in tmp_path.iterdir()] == ["demo.json"]
+    assert (tmp_path / "demo.json").read_bytes() == before

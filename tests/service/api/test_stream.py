@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import socket
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -106,24 +105,10 @@ def test_sets_finished_out_of_order_are_published_in_order(client: Any, pipeline
         assert published[-1] == answers[1]
 
 
-def open_and_never_read(address: str) -> socket.socket:
-    """A subscriber with small buffers that takes no byte after the handshake."""
-    host, port = address.split(":")
-    raw = socket.socket()
-    raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    raw.connect((host, int(port)))
-    raw.sendall(
-        f"GET /stream/demo HTTP/1.1\r\nHost: {address}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
-    )
-    assert b"101" in raw.recv(16)
-    return raw
-
-
 def test_a_reader_that_never_reads_delays_nobody(client: Any, pipeline: Any, tools: Any) -> None:
     """Its buffers are filled with large messages; posts and the quick reader go on, and what it misses is counted."""
     pipeline.boxes = Boxes.concatenate([tools.one_box(float(i)) for i in range(400)])
-    with open_and_never_read(client.address), client.stream() as quick:
+    with tools.open_and_never_read(client.address), client.stream() as quick:
         drops = client.app.state.service.telemetry.drops
         for i in range(100):
             posted = tools.detect(client, data=at(100 + 0.1 * i)).json()
@@ -134,6 +119,23 @@ def test_a_reader_that_never_reads_delays_nobody(client: Any, pipeline: Any, too
         assert drops()["slow_reader"] >= 3
 
 
+def test_a_stalled_reader_is_cut_and_the_others_go_on(start: Callable[..., Any], pipeline: Any, tools: Any) -> None:
+    client = start(reader_stall_s=0.2)
+    pipeline.boxes = Boxes.concatenate([tools.one_box(float(i)) for i in range(400)])
+    drops = client.app.state.service.telemetry.drops
+    with tools.open_and_never_read(client.address) as raw, client.stream() as quick:
+        for i in range(100):
+            posted = tools.detect(client, data=at(100 + 0.1 * i)).json()
+            while receive(quick)["sequence"] != posted["sequence"]:
+                pass
+            if drops()["stalled_reader"]:
+                break
+        tools.wait_until(lambda: 'quadlift_stream_readers{site="demo"} 1.0' in client.get("/metrics").text)
+        with pytest.raises(ConnectionResetError):
+            _ = [raw.recv(1 << 16) for _ in range(1000)]
+    assert drops()["stalled_reader"] == 1
+
+
 def test_the_newest_message_wins() -> None:
     async def scenario() -> tuple[Any, Any, dict[str, int]]:
         telemetry = Telemetry()
@@ -141,7 +143,7 @@ def test_the_newest_message_wins() -> None:
         for text in (b"1", b"2", b"3"):
             reader.offer(Encoded(text, None))
         newest = await reader.take()
-        reader.close()
+        reader.close("over")
         return newest, await reader.take(), telemetry.drops()
 
     newest, end, drops = asyncio.run(scenario())
