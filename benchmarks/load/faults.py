@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -77,8 +78,13 @@ class FaultResult:
 SIGTERM = "sigterm"
 
 
-async def run_faults(kinds: list[str], times: int, seconds: float) -> list[FaultResult]:
-    """Every kind on a service of its own, ``seconds`` for each at most. A kind that fails altogether says so and ends alone."""
+async def run_faults(
+    kinds: list[str], times: int, seconds: float, say: Callable[[FaultResult], None] = lambda _: None
+) -> list[FaultResult]:
+    """Every kind on a service of its own, ``seconds`` for each at most. A kind that fails altogether says so and ends alone.
+
+    say: told of each kind when it is done.
+    """
     results = []
     for kind in kinds:
         result = FaultResult(kind, times)
@@ -89,6 +95,7 @@ async def run_faults(kinds: list[str], times: int, seconds: float) -> list[Fault
         except (TimeoutError, LocalServiceError, ServiceError, httpx.HTTPError, OSError) as error:
             result.remarks.append(f"{type(error).__name__}: {str(error)[:300]}")
         results.append(result)
+        say(result)
     return results
 
 
@@ -112,7 +119,7 @@ async def _run_kind(result: FaultResult, inject: Inject, seconds: float) -> None
                 await _inject_all(result, inject, Scene(load, service, Path(name)), began + seconds)
             result.account = load.account()
             after = await asyncio.to_thread(read_counters, service.url)
-            result.counted = _counted(before, after, result.account, len(streamed.cameras))
+            result.counted = counted(before, after, result.account, len(streamed.cameras))
 
 
 async def _inject_all(result: FaultResult, inject: Inject, scene: Scene, until: float) -> None:
@@ -132,7 +139,7 @@ async def _inject_all(result: FaultResult, inject: Inject, scene: Scene, until: 
         result.remarks.append(f"given up after {failed_in_a_row} faults in a row that were not survived")
 
 
-def _counted(before: Counters, after: Counters, account: Account, cameras: int) -> int:
+def counted(before: Counters, after: Counters, account: Account, cameras: int) -> int:
     """Drops that may explain sets without an answer. Answers 500, 503 and 504 are answers, and their drops explain no other."""
     then, now = before.by_label("dropped", "reason"), after.by_label("dropped", "reason")
     sets = sum(now.get(reason, 0) - then.get(reason, 0) for reason in _SET_DROPS)

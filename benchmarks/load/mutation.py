@@ -92,13 +92,13 @@ class JsonMutator:
         """One of the documents after one to four changes; NaN and infinities as Python writes them."""
         document = json.loads(self._random.choice(self._texts))
         for _ in range(self._random.randint(1, 4)):
-            document = self._changed(document)
+            document = self._changed(document, 0.98)
         return json.dumps(document).encode()
 
-    def _changed(self, value: Any) -> Any:
+    def _changed(self, value: Any, deeper: float = 0.8) -> Any:
+        """deeper: how often something within is changed, where there is something, instead of the whole."""
         draw = self._random
-        # Walk down: deep values are as often changed as whole branches.
-        if isinstance(value, dict | list) and value and draw.random() < 0.8:
+        if isinstance(value, dict | list) and value and draw.random() < deeper:
             key = draw.choice(list(value)) if isinstance(value, dict) else draw.randrange(len(value))
             kind = draw.random()
             if kind < 0.08:

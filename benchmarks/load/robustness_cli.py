@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import json
+import signal
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
 from benchmarks.load.attacks import ATTACKS, run_attacks
-from benchmarks.load.faults import SIGTERM, run_faults
+from benchmarks.load.faults import SIGTERM, FaultResult, run_faults
 from benchmarks.load.injections import KINDS
 from benchmarks.load.parser_fuzz import fuzz_parsers
 from benchmarks.load.readers import UNREACHABLE, measure_readers
@@ -50,7 +51,13 @@ def faults(
     as_json: Json = False,
 ) -> None:
     """Inject faults under load: what the service survives, whose answers go astray, what is lost uncounted."""
-    results = asyncio.run(run_faults(_chosen(kind, [*KINDS, SIGTERM]), times, seconds))
+    chosen = _chosen(kind, [*KINDS, SIGTERM])
+
+    def say(result: FaultResult) -> None:
+        outcome = f"{result.survived} of {result.asked} survived, {result.lost_uncounted} lost"
+        console.print(f"{result.kind}: {outcome}, {result.account.wrong_owner} to a wrong owner", highlight=False)
+
+    results = asyncio.run(run_faults(chosen, times, seconds, say))
     figures = {"faults": [result.document() for result in results]}
     _finish(figures, as_json, passed=all(result.passed for result in results))
 
@@ -94,6 +101,8 @@ def _finish(figures: dict[str, Any], as_json: bool, *, passed: bool) -> None:
 
 def main() -> None:
     """Console entry point."""
+    # As Ctrl-C does: the services that were started are stopped on the way out.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     app()
 
 

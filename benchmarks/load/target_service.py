@@ -81,7 +81,15 @@ def target_service(
 async def serving(site: Mapping[str, Any], **options: Any) -> AsyncIterator[Target]:
     """The same for asyncio code, whose tasks go on while it starts and ends."""
     running = target_service(site, **options)
-    target = await asyncio.to_thread(running.__enter__)
+    starting = asyncio.create_task(asyncio.to_thread(running.__enter__))
+    try:
+        target = await asyncio.shield(starting)
+    except asyncio.CancelledError:
+        # The thread cannot be cancelled: what it has started is stopped, not left behind.
+        await asyncio.wait({starting})
+        if starting.exception() is None:
+            await asyncio.to_thread(running.__exit__, None, None, None)
+        raise
     try:
         yield target
     finally:
