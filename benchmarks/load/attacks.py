@@ -10,6 +10,7 @@ import tempfile
 import time
 from collections.abc import Awaitable, Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -20,7 +21,7 @@ from benchmarks.load.honest import HonestClient, compare
 from benchmarks.load.mutation import ByteMutator
 from benchmarks.load.parsers import parser_targets
 from benchmarks.load.raw_http import endless_bodies, fuzz_raw
-from benchmarks.load.target_service import Target, read_counters, serving
+from benchmarks.load.target_service import Target, put_sites, read_counters, serving
 from clients.client import ServiceError, socket_url
 from clients.clip import Clip, open_clip
 from clients.local_service import LocalServiceError
@@ -36,28 +37,38 @@ Attack = Callable[[Target, Clip, float, int], Awaitable[dict[str, Any]]]
 
 
 async def described(target: Target, clip: Clip, seconds: float, seed: int) -> dict[str, Any]:
-    """Schemathesis over the OpenAPI document; cases and answers are those that the service counted."""
+    """Schemathesis over the OpenAPI document: half of the time with ids of its own, half with those of a site that exists."""
+    site = clip.site | {"id": "probe"}
+    await put_sites(target.url, {"probe": site})
+    known = f'[parameters]\nsite = "probe"\ncamera = "{site["cameras"][0]["id"]}"\n'
+    runs = [await _schemathesis(target, configuration, seconds / 2, seed) for configuration in ("", known)]
+    return {"exit_codes": [code for code, _ in runs], "said": [said for _, said in runs]}
+
+
+async def _schemathesis(target: Target, configuration: str, seconds: float, seed: int) -> tuple[int | None, str]:
+    """One run: its exit code, None when it had to be ended, and its last words."""
     command = [
         sys.executable, "-P", "-c", SCHEMATHESIS, "run", f"{target.url}/openapi.json", "--checks", "not_a_server_error",
         "--continue-on-failure", "--max-time", str(max(1, round(seconds))), "--max-examples", "1000", "--seed", str(seed),
         "--request-timeout", "20", "--suppress-health-check", "all", "--no-color", "--warnings", "off",
     ]  # fmt: skip
     with tempfile.TemporaryDirectory(prefix="quadlift-attack-") as folder:
+        (Path(folder) / "schemathesis.toml").write_text(configuration, "utf-8")
         child = await asyncio.create_subprocess_exec(
             *command, cwd=folder, start_new_session=True, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
         )
         try:
             async with asyncio.timeout(seconds + _SLACK_S):
                 said, _ = await child.communicate()
-            ended = child.returncode
+            code = child.returncode
         except TimeoutError:
-            said, ended = b"", None
+            said, code = b"not done in time", None
         finally:
             if child.returncode is None:
                 os.killpg(child.pid, signal.SIGKILL)
                 await child.wait()
-    text = said.decode("utf-8", "replace")
-    return {"exit_code": ended, "last_words": text[-_SHOWN:] if ended != 0 else text.strip().splitlines()[-1:]}
+    text = said.decode("utf-8", "replace").strip()
+    return code, text[-_SHOWN:] if code != 0 else text.splitlines()[-1].strip("= ")
 
 
 async def raw(target: Target, clip: Clip, seconds: float, seed: int) -> dict[str, Any]:

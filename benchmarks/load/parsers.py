@@ -67,7 +67,7 @@ def _answering(parse: Callable[[bytes], object]) -> Callable[[bytes], None]:
 def small_pictures() -> tuple[bytes, ...]:
     """Whole JPEG and PNG files of all kinds that cameras send, 24 px square: as quick to read as they can be."""
     colour = np.random.default_rng(7).integers(0, 255, (_SIDE_PX, _SIDE_PX, 3), dtype=np.uint8)
-    jpeg = (
+    jpeg: tuple[list[int], ...] = (
         [], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 1],
         [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444], [cv2.IMWRITE_JPEG_OPTIMIZE, 1],
     )  # fmt: skip

@@ -25,7 +25,7 @@ from clients.clip import Clip, open_clip
 from clients.ingest import IngestClient
 from service.schemas import ns_from_rfc3339
 
-ROUNDS = 2
+ROUNDS = 4
 """Times that all read and that one stalls, in turns, so that a drifting machine treats both alike."""
 SETTLE_S = 1.0
 """After a change, before latencies count."""
@@ -145,7 +145,10 @@ async def measure_readers(readers: int, rate_hz: float, seconds: float) -> dict[
                     await stalling.join()
                     try:
                         await asyncio.sleep(SETTLE_S)
+                        # The counters are asked in both phases: that costs the service time, too.
+                        watching = asyncio.create_task(_cut_after(target, site, 0, phase_s))
                         together += await _phase(others, phase_s)
+                        await watching
                         await stalling.stall()
                         cut = asyncio.create_task(_cut_after(target, site, readers - others.lost, phase_s))
                         beside_stalled += await _phase(others, phase_s)

@@ -31,7 +31,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON alone.")]
 def readers(
     count: Annotated[int, typer.Option("--readers", min=2, max=1000, help="Stream readers.")] = 100,
     rate: Annotated[float, typer.Option(min=0.5, max=60, help="Frame sets a second.")] = 10.0,
-    seconds: Annotated[float, typer.Option(min=1, help="Time of the measurement.")] = 40.0,
+    seconds: Annotated[float, typer.Option(min=1, help="Time of the measurement.")] = 64.0,
     as_json: Json = False,
 ) -> None:
     """Many stream readers, then one that stalls: the others' p99, and when the stalled one is cut."""
