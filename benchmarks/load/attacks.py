@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import signal
 import sys
@@ -14,15 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-import websockets.asyncio.client
-from websockets.exceptions import WebSocketException
 
+from benchmarks.load import attackers
 from benchmarks.load.honest import HonestClient, compare
-from benchmarks.load.mutation import ByteMutator
-from benchmarks.load.parsers import parser_targets
-from benchmarks.load.raw_http import endless_bodies, fuzz_raw
 from benchmarks.load.target_service import Target, put_sites, read_counters, serving
-from clients.client import ServiceError, socket_url
+from clients.client import ServiceError
 from clients.clip import Clip, open_clip
 from clients.local_service import LocalServiceError
 
@@ -54,63 +51,52 @@ async def _schemathesis(target: Target, configuration: str, seconds: float, seed
     ]  # fmt: skip
     with tempfile.TemporaryDirectory(prefix="quadlift-attack-") as folder:
         (Path(folder) / "schemathesis.toml").write_text(configuration, "utf-8")
-        child = await asyncio.create_subprocess_exec(
-            *command, cwd=folder, start_new_session=True, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT
-        )
+        code, said = await _run(command, Path(folder), seconds)
+    return code, said[-_SHOWN:] if code != 0 else said.splitlines()[-1].strip("= ")
+
+
+def attacker(name: str) -> Attack:
+    """One of the attackers in a process of its own: it must not slow the honest client by sharing its event loop."""
+
+    async def attack(target: Target, clip: Clip, seconds: float, seed: int) -> dict[str, Any]:
+        command = [sys.executable, "-P", "-c", attackers.PROGRAM, name, target.url, clip.site["id"], str(seconds), str(seed)]
+        code, said = await _run(command, Path.cwd(), seconds)
         try:
-            async with asyncio.timeout(seconds + _SLACK_S):
-                said, _ = await child.communicate()
-            code = child.returncode
-        except TimeoutError:
-            said, code = b"not done in time", None
-        finally:
-            if child.returncode is None:
-                os.killpg(child.pid, signal.SIGKILL)
-                await child.wait()
-    text = said.decode("utf-8", "replace").strip()
-    return code, text[-_SHOWN:] if code != 0 else text.splitlines()[-1].strip("= ")
+            figures: dict[str, Any] = json.loads(said)
+        except ValueError:
+            raise OSError(f"the attacker ended with {code}: {said[-_SHOWN:]}") from None
+        return figures
+
+    return attack
 
 
-async def raw(target: Target, clip: Clip, seconds: float, seed: int) -> dict[str, Any]:
-    """Broken HTTP on plain sockets."""
-    return (await fuzz_raw(target.url, seconds, seed)).document()
-
-
-async def endless(target: Target, clip: Clip, seconds: float, seed: int) -> dict[str, Any]:
-    """Chunked bodies without an end."""
-    return (await endless_bodies(target.url, seconds)).document()
-
-
-async def camera_streams(target: Target, clip: Clip, seconds: float, seed: int) -> dict[str, Any]:
-    """Broken messages over camera streams, four at once, each opened again when it is cut."""
-    until = time.monotonic() + seconds
-    sent = cut = 0
-
-    async def one(number: int) -> None:
-        nonlocal sent, cut
-        parser = parser_targets()["ingest_header"]
-        maker = ByteMutator(parser.corpus, parser.words, seed + number)
-        while time.monotonic() < until:
-            try:
-                address = socket_url(target.url, "ingest", clip.site["id"])
-                async with websockets.asyncio.client.connect(address, open_timeout=10, close_timeout=1, compression=None) as ws:
-                    while time.monotonic() < until:
-                        await ws.send(maker.make())
-                        sent += 1
-            except (OSError, WebSocketException):
-                cut += 1
-                await asyncio.sleep(0.01)
-
-    async with asyncio.timeout(seconds + _SLACK_S):
-        await asyncio.gather(*(one(number) for number in range(4)))
-    return {"messages": sent, "connections_cut": cut}
+async def _run(command: list[str], folder: Path, seconds: float) -> tuple[int | None, str]:
+    """What a process said, and its exit code; None when it had to be ended."""
+    beside = str(Path(__file__).resolve().parents[2])
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [beside, os.environ.get("PYTHONPATH")]))}
+    child = await asyncio.create_subprocess_exec(
+        *command,
+        cwd=folder,
+        env=environment,
+        start_new_session=True,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
+    )
+    try:
+        async with asyncio.timeout(seconds + _SLACK_S):
+            said, _ = await child.communicate()
+        return child.returncode, said.decode("utf-8", "replace").strip()
+    except TimeoutError:
+        return None, "not done in time"
+    finally:
+        if child.returncode is None:
+            os.killpg(child.pid, signal.SIGKILL)
+            await child.wait()
 
 
 ATTACKS: dict[str, Attack] = {
     "schemathesis": described,
-    "raw_http": raw,
-    "endless_bodies": endless,
-    "camera_streams": camera_streams,
+    **{name: attacker(name) for name in attackers.ATTACKERS},
 }
 
 
