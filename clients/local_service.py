@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
@@ -21,6 +21,8 @@ READY_TIMEOUT_S = 60.0
 STOP_TIMEOUT_S = 15.0
 """More than the service takes to finish its work."""
 _POLL_S = 0.1
+SERVE = "from service.cli import main; main()"
+"""What the child process runs."""
 
 
 class LocalServiceError(Exception):
@@ -28,15 +30,19 @@ class LocalServiceError(Exception):
 
 
 @contextmanager
-def running_service(site_file: Path, port: int, options: Sequence[str] = ()) -> Iterator[subprocess.Popen[bytes]]:
+def running_service(
+    site_file: Path, port: int, options: Sequence[str] = (), *, program: str = SERVE, variables: Mapping[str, str] | None = None
+) -> Iterator[subprocess.Popen[bytes]]:
     """The service with one site as a child process, for as long as the block runs.
 
-    options: further arguments of ``quadlift serve``. Raises LocalServiceError with its log when it does not start.
+    options: further arguments of ``quadlift serve``. program: what takes them instead. variables: added to its environment.
+    Raises LocalServiceError with its log when it does not start.
     """
     # The `service` beside this package, and no folder of that name in the working directory.
     beside = str(Path(__file__).resolve().parents[1])
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [beside, os.environ.get("PYTHONPATH")]))}
-    command = [sys.executable, "-P", "-c", "from service.cli import main; main()", "serve"]
+    environment |= variables or {}
+    command = [sys.executable, "-P", "-c", program, "serve"]
     command += ["--host", HOST, "--port", str(port), "--site", str(site_file), *options]
     with tempfile.TemporaryFile() as log:
         # In a session of its own, Ctrl-C reaches the parent alone, which then stops its child in order.

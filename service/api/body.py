@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,9 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import Request
 
 from service.errors import InputError, SlowSenderError, TooLargeError
+
+# It warns of every form that is none; the answer says so already, and no stranger must be able to fill the log.
+logging.getLogger("python_multipart").setLevel(logging.ERROR)
 
 _FORM_REMEDY = "Send multipart/form-data with one file part a camera, for example: curl -F north=@north.jpg."
 

@@ -1,0 +1,84 @@
+"""The service with a pipeline that fails when a file asks for it: faults are injected here, so that the service has no hook.
+
+A file ``SITE.raise``, ``SITE.hang`` or ``SITE.kill`` in the folder that ``BENCH_FAULTS`` names strikes the next frame set of
+that site, once.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from enum import StrEnum
+from pathlib import Path
+
+from service.frames import FrameSet
+from service.pipeline import SetResult
+from service.scheduler import FrameSetRunner
+from service.settings import Settings
+
+FOLDER_VARIABLE = "BENCH_FAULTS"
+PROGRAM = "from benchmarks.load.faulty_service import main; main()"
+HANG_S = 8.0
+"""Long enough that the service must act, short enough that a service which does not comes back by itself."""
+
+
+class NetworkFault(StrEnum):
+    """What the pipeline does instead of its work."""
+
+    RAISE = "raise"
+    HANG = "hang"
+    KILL = "kill"
+    """Ends the worker's thread, as an error does that no handler knows."""
+
+
+class FaultyRunner:
+    """A pipeline's run with faults before it. Thread-safe: each file strikes once."""
+
+    def __init__(self, runner: FrameSetRunner, folder: Path) -> None:
+        self._runner = runner
+        self._folder = folder
+
+    def run(self, frame_set: FrameSet) -> SetResult:
+        """The result of a frame set, unless a fault strikes it."""
+        fault = self._claim(frame_set.site.id)
+        if fault is NetworkFault.RAISE:
+            raise RuntimeError("an injected fault of the networks")
+        if fault is NetworkFault.HANG:
+            time.sleep(HANG_S)
+        if fault is NetworkFault.KILL:
+            raise SystemExit("an injected end of the worker")
+        return self._runner.run(frame_set)
+
+    def warm_up(self) -> None:
+        """As the pipeline's own."""
+        self._runner.warm_up()
+
+    def _claim(self, site_id: str) -> NetworkFault | None:
+        for fault in NetworkFault:
+            try:
+                # Only one thread can remove it.
+                fault_file(self._folder, site_id, fault).unlink()
+            except FileNotFoundError:
+                continue
+            return fault
+        return None
+
+
+def fault_file(folder: Path, site_id: str, fault: NetworkFault) -> Path:
+    """The file that asks for a fault."""
+    return folder / f"{site_id}.{fault}"
+
+
+def main() -> None:
+    """``quadlift serve`` with the pipeline wrapped."""
+    import service.api.app as app
+    from service.cli import main as serve
+
+    folder = Path(os.environ[FOLDER_VARIABLE])
+    own = app.default_pipeline
+
+    def faulty(settings: Settings) -> FrameSetRunner:
+        return FaultyRunner(own(settings), folder)
+
+    app.default_pipeline = faulty
+    serve()
