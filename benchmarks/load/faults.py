@@ -26,6 +26,8 @@ EXIT_S = 12.0
 """Ten seconds to drain, and some for the process to end."""
 _ON_ITS_WAY_S = 0.1
 """A request sent this long before SIGTERM has arrived."""
+_BURST = 12
+"""Requests at once before SIGTERM; fewer than may queue."""
 _SET_DROPS = (
     "queue_full", "deadline", "stopping", "cancelled", "failed", "hung", "unfinished", "superseded", "undecodable", "late",
     "slow_reader",
@@ -47,6 +49,8 @@ class FaultResult:
     account: Account = field(default_factory=Account)
     counted: int = 0
     """Sets without an answer that the service's counters explain, at most."""
+    in_flight: int = 0
+    """Requests that had arrived and had no answer yet when the process was told to end; all kinds but SIGTERM: 0."""
     remarks: list[str] = field(default_factory=list)
 
     @property
@@ -69,6 +73,7 @@ class FaultResult:
             "wrong_owner": account.wrong_owner,
             "requests": account.sent,
             "statuses": {str(status): count for status, count in sorted(account.statuses.items())},
+            "in_flight": self.in_flight,
             "unanswered": account.unanswered, "stream_sets": account.moments, "stream_sets_seen": account.seen,
             "counted": self.counted, "lost_uncounted": self.lost_uncounted, "passed": self.passed,
             "remarks": sorted(set(self.remarks)),
@@ -162,7 +167,14 @@ async def _run_sigterm(result: FaultResult, seconds: float) -> None:
                 if await load.recovers(RECOVER_S) is None:
                     result.remarks.append("the load did not come up")
                     continue
-                _terminate_and_account(result, load, *await _terminate(service))
+                # More than the workers can do at once, so that some wait and some run when the signal comes.
+                burst = [asyncio.create_task(load.target.post()) for _ in range(_BURST)]
+                load.background += burst
+                await asyncio.sleep(_ON_ITS_WAY_S + 0.02)
+                result.in_flight += sum(not task.done() for task in burst)
+                ended = await _terminate(service)
+                await asyncio.gather(*burst)
+                _account_of_sigterm(result, load, *ended)
 
 
 async def _terminate(service: Target) -> tuple[float, float | None, int | None]:
@@ -173,7 +185,7 @@ async def _terminate(service: Target) -> tuple[float, float | None, int | None]:
     return at, time.monotonic() - at if ended else None, service.process.returncode
 
 
-def _terminate_and_account(result: FaultResult, load: Load, at: float, took_s: float | None, code: int | None) -> None:
+def _account_of_sigterm(result: FaultResult, load: Load, at: float, took_s: float | None, code: int | None) -> None:
     result.injected += 1
     if took_s is None:
         result.remarks.append(f"still running {EXIT_S:.0f} s after SIGTERM")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import signal
 from typing import Annotated, Any
 
@@ -90,13 +91,22 @@ def _chosen(wanted: list[str] | None, known: list[str]) -> list[str]:
 
 def _finish(figures: dict[str, Any], as_json: bool, *, passed: bool) -> None:
     """Print, and end with 1 where a limit was not kept."""
-    figures = figures | {"machine": describe_machine(), "passed": passed}
+    figures = _plain(figures | {"machine": describe_machine(), "passed": passed})
     if as_json:
         typer.echo(json.dumps(figures, indent=1))
     else:
         Console().print_json(data=figures)
     if not passed:
         raise typer.Exit(1)
+
+
+def _plain(value: Any) -> Any:
+    """The same without NaN and infinities, which JSON has not: what could not be measured is null."""
+    if isinstance(value, dict):
+        return {key: _plain(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [_plain(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def main() -> None:
