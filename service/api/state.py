@@ -113,7 +113,8 @@ class Service:
             connection.go_away()
         feeds = asyncio.create_task(self.feeds.stop())
         await asyncio.wait({feeds}, timeout=max(0.0, until - loop.time()))
-        left = await in_daemon_thread(lambda: self.scheduler.stop(max(0.0, until - loop.time())))
+        remaining_s = max(0.0, until - loop.time())
+        left = await in_daemon_thread(lambda: self.scheduler.stop(remaining_s))
         live = asyncio.create_task(self.live.stop())
         await asyncio.wait({feeds, live}, timeout=(1 - _WORK_SHARE) / 2 * self.settings.drain_s)
         for task in (feeds, live):
