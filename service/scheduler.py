@@ -19,6 +19,7 @@ from service.errors import OverloadError, QuadliftError
 from service.fair_queue import FairQueue, Job
 from service.frames import FrameSet
 from service.logs import on_behalf_of
+from service.run_limit import RunLimit
 from service.telemetry import Drop, Telemetry
 from service.workers import WorkerPool
 
@@ -31,8 +32,6 @@ MAX_ABANDONED = 4
 """Threads that may hang while other workers take their place."""
 _CHECK_S = 0.2
 """Seconds between two looks after the workers and the queue."""
-_LIMIT_FRAMES = 4
-"""Frames of a set for which the run limit stands; a larger set may run longer in proportion."""
 
 
 class FrameSetRunner(Protocol):
@@ -61,7 +60,7 @@ class Scheduler:
         workers: int,
         queue_size: int = 16,
         deadline_s: float = 1.0,
-        run_limit_s: float | None = None,
+        run_limit: RunLimit | None = None,
         max_abandoned: int = MAX_ABANDONED,
         telemetry: Telemetry | None = None,
         clock: Callable[[], float] = time.monotonic,
@@ -72,8 +71,8 @@ class Scheduler:
         its camera streams.
         deadline_s: seconds that one may wait. max_abandoned: threads that may hang before workers are lost for good.
         """
-        self.run_limit_s = run_limit_s
-        """Seconds that a set of up to four frames may run; beyond that its worker counts as hung. None: for ever."""
+        self.run_limit = run_limit
+        """How long a set may run; beyond that its worker counts as hung. None: for ever."""
         self._runner = runner
         self._queue_size = queue_size
         self._deadline_s = deadline_s
@@ -178,9 +177,7 @@ class Scheduler:
                 logger.exception("The workers could not be looked after")
 
     def _limit_s(self, job: Job) -> float | None:
-        if self.run_limit_s is None:
-            return None
-        return self.run_limit_s * max(1.0, len(job.frame_set.frames) / _LIMIT_FRAMES)
+        return None if self.run_limit is None else self.run_limit.seconds(len(job.frame_set.frames))
 
     def _is_full(self) -> bool:
         # A job that an idle worker is about to take does not wait, so it takes no place.
@@ -218,6 +215,7 @@ class Scheduler:
                 self._telemetry.dropped(Drop.CANCELLED)
 
     def _run(self, job: Job) -> None:
+        began, limit = self._clock(), self.run_limit
         with on_behalf_of(job.request_id):
             try:
                 result = self._runner.run(job.frame_set)
@@ -230,6 +228,8 @@ class Scheduler:
                     self._telemetry.dropped(Drop.FAILED)
             else:
                 job.succeed(result)
+        if limit is not None:
+            limit.note(self._clock() - began, len(job.frame_set.frames))
 
     def _is_dead(self, job: Job) -> bool:
         """Whether nobody waits for a job any more, or it has waited too long."""

@@ -130,6 +130,7 @@ class WorkerPool:
 
     def _work(self, worker: _Worker) -> None:
         cause: BaseException | None = None
+        job: Job | None = None
         try:
             while (job := self._take()) is not None:
                 with self._lock:
@@ -142,6 +143,9 @@ class WorkerPool:
         except BaseException as error:
             # Not only Exception: a worker that ends by SystemExit or the like must be answered for and replaced as well.
             cause = error
+            if worker.job is None and job is not None:
+                # It ended just before it noted the job, or just after it had answered it.
+                worker.job = job
         finally:
             self._ended(worker, cause)
 

@@ -18,6 +18,7 @@ from service.api.feeds import Feeds
 from service.api.live import LiveSites
 from service.api.recent import RecentFrames
 from service.errors import OverloadError
+from service.run_limit import RunLimit
 from service.scheduler import FrameSetRunner, Scheduler
 from service.settings import Settings
 from service.sites_store import SitesStore
@@ -91,10 +92,11 @@ class Service:
             return
         limit_ms = self.settings.run_limit_ms
         took_s = time.monotonic() - began
-        self.scheduler.run_limit_s = max(_MIN_RUN_LIMIT_S, _RUN_LIMIT_WARM_UPS * took_s) if limit_ms is None else limit_ms / 1e3
+        floor_s = max(_MIN_RUN_LIMIT_S, _RUN_LIMIT_WARM_UPS * took_s) if limit_ms is None else limit_ms / 1e3
+        self.scheduler.run_limit = RunLimit(floor_s, adapts=limit_ms is None)
         if self.phase == "starting":
             self.phase = "ready"
-            logger.info("ready; a frame set may run for %.1f s", self.scheduler.run_limit_s)
+            logger.info("ready; a frame set may run for %.1f s", floor_s)
 
     async def drain(self) -> None:
         """Refuse what comes, and finish what was accepted, within the time of the settings; a second call does nothing.
@@ -111,7 +113,8 @@ class Service:
             connection.go_away()
         feeds = asyncio.create_task(self.feeds.stop())
         await asyncio.wait({feeds}, timeout=max(0.0, until - loop.time()))
-        left = await in_daemon_thread(lambda: self.scheduler.stop(max(0.0, until - loop.time())))
+        remaining_s = max(0.0, until - loop.time())
+        left = await in_daemon_thread(lambda: self.scheduler.stop(remaining_s))
         live = asyncio.create_task(self.live.stop())
         await asyncio.wait({feeds, live}, timeout=(1 - _WORK_SHARE) / 2 * self.settings.drain_s)
         for task in (feeds, live):

@@ -13,6 +13,7 @@ import pytest
 
 from service.errors import FrameError, OverloadError, QuadliftError, RunTimeoutError
 from service.frames import EncodedFrame, FrameSet
+from service.run_limit import RunLimit
 from service.scheduler import Scheduler
 from service.site import Site
 from service.telemetry import Telemetry
@@ -262,7 +263,7 @@ def test_a_worker_that_hangs_is_replaced_and_its_late_result_thrown_away(
 ) -> None:
     clock = Clock()
     runner.gates[1] = threading.Event()
-    scheduler = start(run_limit_s=1.5, clock=clock)
+    scheduler = start(run_limit=RunLimit(1.5), clock=clock)
     hung = scheduler.enqueue(frame_set(1))
     assert runner.begun.acquire(timeout=5)
     clock.now = 1.5
@@ -289,7 +290,7 @@ def test_a_worker_that_hangs_is_replaced_and_its_late_result_thrown_away(
 def test_many_cameras_may_take_longer(start: Callable[..., Scheduler], runner: Runner) -> None:
     clock = Clock()
     runner.gates[1] = threading.Event()
-    scheduler = start(run_limit_s=1.5, clock=clock)
+    scheduler = start(run_limit=RunLimit(1.5), clock=clock)
     slow = scheduler.enqueue(frame_set(1, frames=16))
     assert runner.begun.acquire(timeout=5)
     clock.now = 5.9
@@ -302,7 +303,7 @@ def test_too_many_hung_threads_are_told_and_one_that_comes_back_mends_it(
     start: Callable[..., Scheduler], runner: Runner, telemetry: Telemetry, caplog: pytest.LogCaptureFixture
 ) -> None:
     clock = Clock()
-    scheduler = start(workers=1, run_limit_s=1.0, max_abandoned=1, clock=clock, deadline_s=60)
+    scheduler = start(workers=1, run_limit=RunLimit(1.0), max_abandoned=1, clock=clock, deadline_s=60)
     hung = []
     for number in (1, 2):
         runner.gates[number] = threading.Event()
@@ -355,7 +356,7 @@ def test_a_worker_that_hangs_while_stopping_keeps_nothing_from_being_finished(
 ) -> None:
     clock = Clock()
     runner.gates[1] = threading.Event()
-    scheduler = start(run_limit_s=1.0, clock=clock, deadline_s=30)
+    scheduler = start(run_limit=RunLimit(1.0), clock=clock, deadline_s=30)
     hung, waiting = scheduler.enqueue(frame_set(1)), scheduler.enqueue(frame_set(2))
     assert runner.begun.acquire(timeout=5)
     stopping = threading.Thread(target=scheduler.stop)
