@@ -1,1 +1,0 @@
-"""The running service under load, faults and attacks."""
