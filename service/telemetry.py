@@ -15,6 +15,8 @@ class Drop(StrEnum):
 
     QUEUE_FULL = "queue_full"
     """A frame set found no place in the queue."""
+    BODIES_FULL = "bodies_full"
+    """A request's body found no room beside those under way."""
     DEADLINE = "deadline"
     """A frame set waited too long for a worker."""
     STOPPING = "stopping"

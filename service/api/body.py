@@ -12,7 +12,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 from starlette.requests import Request
 
-from service.errors import InputError, SlowSenderError, TooLargeError
+from service.errors import InputError, OverloadError, SlowSenderError, TooLargeError
 
 # It warns of every form that is none; the answer says so already, and no stranger must be able to fill the log.
 logging.getLogger("python_multipart").setLevel(logging.ERROR)
@@ -30,11 +30,32 @@ class Part:
     data: bytes
 
 
-async def read_body(request: Request, max_bytes: int, limit_s: float) -> bytes:
+class BodyRoom:
+    """Memory for the bodies that are being received, of all requests together. Belongs to one event loop."""
+
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes = max_bytes
+        self.held_bytes = 0
+
+    def take(self, size: int) -> None:
+        """Take room for ``size`` bytes; whoever takes gives it back. Raises OverloadError when there is none."""
+        if self.held_bytes + size > self._max_bytes:
+            raise OverloadError(
+                f"{self.held_bytes} bytes of bodies are under way, and {self._max_bytes} may be.",
+                remedy="Send fewer bodies at a time, or raise QUADLIFT_MAX_BODIES_BYTES.",
+            )
+        self.held_bytes += size
+
+    def give(self, size: int) -> None:
+        """Give back room that was taken."""
+        self.held_bytes -= size
+
+
+async def read_body(request: Request, max_bytes: int, limit_s: float, room: BodyRoom) -> bytes:
     """The request's body.
 
     Raises TooLargeError as soon as it is, or announces to be, longer than ``max_bytes``; SlowSenderError when it has not come
-    after ``limit_s`` seconds.
+    after ``limit_s`` seconds; OverloadError when all bodies under way want more than ``room``.
     """
     announced = request.headers.get("content-length", "")
     if announced.isdecimal() and int(announced) > max_bytes:
@@ -43,15 +64,18 @@ async def read_body(request: Request, max_bytes: int, limit_s: float) -> bytes:
     try:
         async with asyncio.timeout(limit_s):
             async for chunk in request.stream():
-                body += chunk
-                if len(body) > max_bytes:
+                if len(body) + len(chunk) > max_bytes:
                     raise _too_long("more bytes", max_bytes)
+                room.take(len(chunk))
+                body += chunk
     except TimeoutError:
         raise SlowSenderError(
             f"{len(body)} bytes came within {limit_s:g} s, and not the end.",
             field="body",
             remedy="Send faster, compress the frames more, or raise QUADLIFT_BODY_RECEIVE_S.",
         ) from None
+    finally:
+        room.give(len(body))
     return bytes(body)
 
 

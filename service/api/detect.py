@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request
 from starlette.responses import Response
 
-from service.api.body import Part, parse_multipart, read_body
+from service.api.body import Part, parse_multipart
 from service.api.messages import Encoded, detections_message, encode, encode_json, finite_only, per_camera_boxes
 from service.api.state import Service, ServiceDep
 from service.errors import InputError
@@ -60,7 +60,7 @@ async def detect(
     service.require_ready()
     # Refusing before the frames are read leaves the processor to the sets that were accepted.
     service.scheduler.require_room(site)
-    body = await read_body(request, service.settings.max_body_bytes, service.settings.body_receive_s)
+    body = await service.read_body(request)
     frames, captured_at_ns = await asyncio.to_thread(
         frames_from_form, body, request.headers.get("content-type"), known_site, service.settings.frame_limits, arrived_at_ns
     )

@@ -9,7 +9,7 @@ import orjson
 from fastapi import APIRouter, Query, Request
 from starlette.responses import Response
 
-from service.api.body import parse_json, read_body
+from service.api.body import parse_json
 from service.api.state import ServiceDep
 from service.errors import CalibrationError, InputError, NotFoundError
 from service.frames import read_header
@@ -46,7 +46,7 @@ async def get_site(site: str, service: ServiceDep) -> Response:
 )
 async def put_site(site: str, request: Request, service: ServiceDep) -> Response:
     """Add a site (201) or replace it (200); answers with the site as kept. The stream, if it runs, goes on."""
-    body = await read_body(request, service.settings.max_body_bytes, service.settings.body_receive_s)
+    body = await service.read_body(request)
     new = await asyncio.to_thread(_parse_site, body, site)
     created = await asyncio.to_thread(service.store.put, new)
     return _json(site_document(new), 201 if created else 200)
@@ -77,7 +77,7 @@ async def get_camera(site: str, camera: str, service: ServiceDep) -> Response:
 async def put_camera(site: str, camera: str, request: Request, service: ServiceDep) -> Response:
     """Let a camera join a site (201), or replace its calibration (200), while the site runs."""
     service.store.get(site)
-    body = await read_body(request, service.settings.max_body_bytes, service.settings.body_receive_s)
+    body = await service.read_body(request)
     new = await asyncio.to_thread(_parse_camera, body, camera)
     created = await asyncio.to_thread(service.store.put_camera, site, new)
     return _json(_camera_document(new), 201 if created else 200)

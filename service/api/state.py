@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal, Protocol, TypeVar
 
 from fastapi import Depends
-from starlette.requests import HTTPConnection
+from starlette.requests import HTTPConnection, Request
 
+from service.api.body import BodyRoom, read_body
 from service.api.feeds import Feeds
 from service.api.live import LiveSites
 from service.api.recent import RecentFrames
@@ -22,7 +23,7 @@ from service.run_limit import RunLimit
 from service.scheduler import FrameSetRunner, Scheduler
 from service.settings import Settings
 from service.sites_store import SitesStore
-from service.telemetry import Telemetry
+from service.telemetry import Drop, Telemetry
 
 logger = logging.getLogger(__name__)
 
@@ -66,7 +67,17 @@ class Service:
     phase: Phase = field(default="starting", init=False)
 
     def __post_init__(self) -> None:
+        self._bodies = BodyRoom(self.settings.max_bodies_bytes)
         self.telemetry.ready(lambda: self.trouble() is None)
+
+    async def read_body(self, request: Request) -> bytes:
+        """A request's body within the settings' limits; raises as :func:`service.api.body.read_body`."""
+        settings = self.settings
+        try:
+            return await read_body(request, settings.max_body_bytes, settings.body_receive_s, self._bodies)
+        except OverloadError:
+            self.telemetry.dropped(Drop.BODIES_FULL)
+            raise
 
     def trouble(self) -> str | None:
         """Why the service is not ready; None when it is."""
