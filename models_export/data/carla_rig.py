@@ -21,7 +21,18 @@ from models_export.data.carla_images import field_of_view_deg, intrinsics
 from service.errors import CalibrationError
 from service.geometry.camera import Camera
 from service.geometry.transforms import Array, rigid
-from service.site import ID_PATTERN, MAX_SIDE_PX, CameraModel, Finite, GroundModel, OriginModel, Site, parse_site, site_document
+from service.site import (
+    ID_PATTERN,
+    MAX_SIDE_PX,
+    AccuracyModel,
+    CameraModel,
+    Finite,
+    GroundModel,
+    OriginModel,
+    Site,
+    parse_site,
+    site_document,
+)
 
 _K_TOLERANCE_PX = 1e-3
 _REMEDY = "See docs/carla.md for the form of a rig."
@@ -77,6 +88,7 @@ class RigModel(_Strict):
     anchor: AnchorModel = Field(default_factory=AnchorModel)
     ground: GroundModel = Field(default_factory=GroundModel)
     origin: OriginModel | None = None
+    accuracy: AccuracyModel = Field(default_factory=AccuracyModel)
     cameras: Annotated[list[dict[str, Any]], Field(min_length=1, max_length=64)]
 
 
@@ -130,6 +142,7 @@ def parse_rig(document: Any) -> Rig:
     draft = site_document(Site(model.id, tuple(mount.camera for mount in mounts)))
     draft["ground"] = model.ground.model_dump()
     draft["origin"] = (model.origin or OriginModel()).model_dump()
+    draft["accuracy"] = model.accuracy.model_dump()
     site = parse_site(draft)
     pairs = zip(site.cameras, mounts, strict=True)
     mounted = tuple(Mount(camera, mount.pose, mount.fov_deg) for camera, mount in pairs)

@@ -47,7 +47,7 @@ def _toy_sample(rng: np.random.Generator, camera: Camera) -> Sample:
         top, width, height = rng.integers(20, 50), rng.integers(24, 44), rng.integers(14, 30)
         canvas[top : top + height, left : left + width] = rng.integers(160, 255, 3)
         boxes.append([left, top, left + width - 1, top + height - 1])
-    rows = np.arange(HEIGHT // 16)[:, None] + np.zeros(WIDTH // 16)
+    rows = np.arange(HEIGHT // 8)[:, None] + np.zeros(WIDTH // 8)
     return Sample(
         canvas=canvas,
         image_size=(WIDTH, HEIGHT),
@@ -64,7 +64,7 @@ def _toy_sample(rng: np.random.Generator, camera: Camera) -> Sample:
         truncated=np.zeros(2),
         center=rng.uniform([10.0, -4.0, 0.7], [20.0, 4.0, 0.8], (2, 3)),
         ground=GroundPlane(),
-        inverse_depth=(0.02 + 0.02 * rows).astype(np.float32),
+        inverse_depth=(0.02 + 0.01 * rows).astype(np.float32),
     )
 
 

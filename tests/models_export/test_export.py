@@ -21,7 +21,7 @@ from service.errors import PackError
 from service.nets.detector import Detector
 from service.nets.pack import load_pack, open_network
 
-DETECTOR = DetectorConfig(channels=(8, 8, 16, 24, 32), residuals=(0, 1, 1, 0))
+DETECTOR = DetectorConfig(channels=(8, 16, 24, 32), residuals=(1, 1, 0))
 METADATA = {
     "classes": list(DETECTOR.classes),
     "strides": list(DETECTOR.strides),
@@ -55,13 +55,13 @@ def test_the_detector_agrees_on_any_canvas(detector: tuple[EdgeDetector, bytes])
 
 
 def test_the_multibin_head_agrees_on_any_batch() -> None:
-    net = EdgeMultibin(MultibinConfig(crop_px=32, channels=(8, 8, 16, 16), squeezed=16)).eval()
+    net = EdgeMultibin(MultibinConfig(crop_px=32, channels=(8, 16, 16), residuals=(1, 1), squeezed=16)).eval()
     model = with_metadata(to_onnx(net, "multibin", (32, 32), tuple("abcde"), dynamic_hw=False), {})
     require_parity(net, open_network("multibin", model), [street_like(32, 32, 1), street_like(32, 32, 7)])
 
 
 def test_the_depth_net_agrees_on_any_canvas() -> None:
-    net = EdgeDepth(DepthConfig(stem=(8, 8, 16, 16), width=32, blocks=1, heads=2, decoder=8)).eval()
+    net = EdgeDepth(DepthConfig(stem=(8, 16, 16), width=32, blocks=1, heads=2, decoder=8)).eval()
     model = with_metadata(to_onnx(net, "depth", (96, 160), ("d",), dynamic_hw=True), {})
     require_parity(net, open_network("depth", model), [street_like(96, 160), street_like(64, 224, 1)])
 

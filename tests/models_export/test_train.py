@@ -16,6 +16,7 @@ from models_export.data.samples import Sample
 from models_export.nets.depth import DepthConfig
 from models_export.nets.detector import DetectorConfig
 from models_export.nets.multibin import MultibinConfig
+from models_export.train.batches import batches
 from models_export.train.checkpoint import load_averaged, read_checkpoint
 from models_export.train.config import Optimizer, TrainConfig
 from models_export.train.depth import DepthTask
@@ -30,6 +31,12 @@ SHORT = TrainConfig(steps=60, batch_size=4, learning_rate=3e-3, warmup_steps=5, 
 SMALL_DETECTOR = DetectorConfig(channels=(8, 16, 24, 32), residuals=(1, 1, 0))
 SMALL_DEPTH = DepthConfig(stem=(8, 16, 16), width=32, blocks=1, heads=2, decoder=8)
 SMALL_HEAD = MultibinConfig(crop_px=32, channels=(8, 16, 16), residuals=(1, 1), squeezed=16, dropout=0.1)
+
+
+@pytest.fixture(scope="session")
+def toy_samples(toy_samples: list[Sample]) -> list[Sample]:
+    """The toys with a truth of the edge depth net's cells: every 16 px instead of every 8."""
+    return [replace(sample, inverse_depth=sample.inverse_depth[::2, ::2]) for sample in toy_samples]
 
 
 def task_of(name: str, samples: list[Sample]) -> DetectorTask | MultibinTask | DepthTask:
@@ -206,3 +213,13 @@ def test_a_loss_that_is_not_finite_is_refused(toy_samples: list[Sample], tmp_pat
     with pytest.raises(InputError, match="not finite") as caught:
         fit(task, SHORT, tmp_path)
     assert caught.value.field == "learning_rate"
+
+
+def test_processes_prepare_the_batches_that_threads_do(toy_samples: list[Sample]) -> None:
+    task = task_of("multibin", toy_samples)
+    config = replace(SHORT, steps=4, workers=2)
+    beside_a_gpu = list(batches(task, replace(config, device="cuda"), 1))
+    expected = list(batches(task, config, 1))
+    assert len(beside_a_gpu) == len(expected) == 3
+    for ours, theirs in zip(beside_a_gpu, expected, strict=True):
+        assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
