@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from models_export.data.samples import Sample
 from service.depth_scale import DepthScale, fit_scale, ground_inverse_depth, read_boxes
 from service.errors import InputError
-from service.geometry.boxes import cut_edges, scaled_extents, tangents_of
+from service.geometry.boxes import cut_edges, scaled_extents, scaled_points, tangents_of
 from service.geometry.camera import Camera, ray_azimuth
 from service.geometry.iou import iou_2d
 from service.geometry.transforms import Array, wrap_angle
@@ -215,7 +215,7 @@ def _head_errors(multibin: Multibin, m: Matched) -> _HeadErrors:
     factor = np.array([image.shape[1] / sample.image_size[0], image.shape[0] / sample.image_size[1]])
     detected, truth = (scaled_extents(xyxy, factor) for xyxy in (m.xyxy_px, sample.xyxy_px[m.truth]))
     estimate = multibin.estimate(cut_crops(image, detected, spec.crop_px), sample.cls[m.truth])
-    corners = (sample.corners_px[m.truth] + 0.5) * factor - 0.5
+    corners = scaled_points(sample.corners_px[m.truth], factor)
     turn = wrap_angle(estimate.alpha + _azimuth(camera, detected) - sample.alpha[m.truth] - _azimuth(camera, truth))
     flip = np.abs(turn) > np.pi / 2
     cut = cut_edges(camera, detected)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.geometry.boxes import BORDER_PX, TANGENT_DIRECTIONS, Boxes, box_corners, tangents_of
+from service.geometry.boxes import BORDER_PX, TANGENT_DIRECTIONS, Boxes, box_corners, extents_of, tangents_of
 from service.geometry.camera import MIN_DEPTH_M, Camera
 from service.geometry.ground import Ground
 from service.geometry.transforms import Array, transform_points, wrap_angle
@@ -139,9 +139,9 @@ def _straightened(
         corners = transform_points(camera.T_cam_world, box_corners(state[mine, :3], state[mine, 3:6], state[mine, 6]))
         image = corners[..., :2] / np.maximum(corners[..., 2:], MIN_DEPTH_M)
         pixels = camera.pixels_from_normalised(image)
-        miss = seen.xyxy_px[mine] - np.concatenate([pixels.min(1), pixels.max(1)], 1)
+        miss = seen.xyxy_px[mine] - extents_of(pixels)
         focal = camera.K[[0, 1, 0, 1], [0, 1, 0, 1]]
-        straight = np.concatenate([image.min(1), image.max(1)], 1) + miss / focal
+        straight = extents_of(image) + miss / focal
         # Far from its edge, or past the border, a box may lie where the lens model means nothing.
         trusted = ~problem.hinged[mine] & (np.abs(miss) < _MAX_LENS_MISS * focal)
         edges[mine] = np.where(trusted, straight, edges[mine])

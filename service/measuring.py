@@ -62,8 +62,13 @@ class Still:
 
 def cut_detected(stills: Sequence[Still], found: Sequence[Detections], crop_px: int) -> Crops:
     """Crops of all detections (in px of ``small``), a still after the other."""
-    pairs = zip(stills, found, strict=True)
-    return Crops.concatenate([cut_crops(still.image, own.scaled(still.scale).xyxy_px, crop_px) for still, own in pairs])
+    pairs = zip(stills, _in_image(stills, found), strict=True)
+    return Crops.concatenate([cut_crops(still.image, xyxy, crop_px) for still, xyxy in pairs])
+
+
+def _in_image(stills: Sequence[Still], found: Sequence[Detections]) -> list[Array]:
+    """Each still's detected boxes (n, 4), which are in px of ``small``, in px of ``image``."""
+    return [own.scaled(still.scale).xyxy_px for still, own in zip(stills, found, strict=True)]
 
 
 def refined(
@@ -77,7 +82,7 @@ def refined(
     if estimates.xyxy_px is None or not len(estimates.alpha):
         return estimates
     index = np.repeat(np.arange(len(stills)), [len(own) for own in found])
-    boxes = np.concatenate([own.scaled(still.scale).xyxy_px for still, own in zip(stills, found, strict=True)])
+    boxes = np.concatenate(_in_image(stills, found))
     side = (boxes[:, 2:] - boxes[:, :2]).max(1)
     shift = np.abs(estimates.xyxy_px - boxes).max(1) / np.maximum(side, 1.0)
     again = np.flatnonzero((shift > least_shift) & (shift < _MOST_SHIFT))
@@ -101,8 +106,8 @@ def measure(
 ) -> Measurements:
     """What the networks say of all detections, in px of ``image``, each reading with its standard deviation."""
     index = np.repeat(np.arange(len(stills)), [len(own) for own in found])
-    large = [own.scaled(still.scale).xyxy_px for still, own in zip(stills, found, strict=True)]
-    seen = np.concatenate([clip_extents(still.camera, xyxy) for still, xyxy in zip(stills, large, strict=True)])
+    pairs = zip(stills, _in_image(stills, found), strict=True)
+    seen = np.concatenate([clip_extents(still.camera, xyxy) for still, xyxy in pairs])
     cut = np.concatenate([cut_edges(still.camera, seen[index == row]) for row, still in enumerate(stills)])
     score = np.concatenate([own.score for own in found])
     scale = np.tile(np.array([still.scale for still in stills]).reshape(-1, 2), 2)[index]

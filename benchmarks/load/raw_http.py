@@ -97,13 +97,10 @@ async def endless_bodies(url: str, seconds: float, connections: int = 8) -> RawR
 
 
 async def _endless(host: str, port: int, head: bytes, result: RawResult, until: float) -> None:
-    result.cases += 1
-    try:
-        async with asyncio.timeout(CONNECT_S):
-            reader, writer = await asyncio.open_connection(host, port)
-    except (OSError, TimeoutError):
-        result.connections_refused += 1
+    connection = await _connected(host, port, result)
+    if connection is None:
         return
+    reader, writer = connection
     answer = asyncio.create_task(reader.read(65536))
     try:
         writer.write(head)
@@ -122,14 +119,22 @@ async def _endless(host: str, port: int, head: bytes, result: RawResult, until: 
         await _close(writer, answer)
 
 
-async def _exchange(host: str, port: int, data: bytes, result: RawResult) -> None:
+async def _connected(host: str, port: int, result: RawResult) -> tuple[asyncio.StreamReader, asyncio.StreamWriter] | None:
+    """A new case's connection; None, and counted, when there was none to be had."""
     result.cases += 1
     try:
         async with asyncio.timeout(CONNECT_S):
-            reader, writer = await asyncio.open_connection(host, port)
+            return await asyncio.open_connection(host, port)
     except (OSError, TimeoutError):
         result.connections_refused += 1
+        return None
+
+
+async def _exchange(host: str, port: int, data: bytes, result: RawResult) -> None:
+    connection = await _connected(host, port, result)
+    if connection is None:
         return
+    reader, writer = connection
     answer = bytearray()
     try:
         async with asyncio.timeout(ANSWER_S):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from models_export.data.dataset import UNKNOWN_CONDITION, Scene, SceneTruth, list_scenes, open_scene
 from models_export.data.detection import MIN_SIDE_PX, VEHICLES, Still, VehicleSample, class_columns
 from service.errors import InputError
-from service.geometry.boxes import clip_extents, project_corners, project_extents
+from service.geometry.boxes import clip_extents, extents_of, project_corners
 from service.geometry.camera import Camera, ray_azimuth
 from service.geometry.ground import Ground
 from service.geometry.transforms import Array, wrap_angle
@@ -98,10 +98,10 @@ def _load_sample(
 ) -> Sample:
     still = Still(scene.frame_bytes(camera.id, step), camera)
     image, scaled = still.at(max_width)
-    extents, in_front = project_extents(scaled, truth.center, truth.dims_lwh, truth.yaw)
+    corners, in_front = project_corners(scaled, truth.center, truth.dims_lwh, truth.yaw)
     kinds = np.array(truth.kinds, dtype=str)
     seen = in_front & (truth.visible[:, camera_index] > 0) & (np.isin(kinds, classes) | np.isin(kinds, VEHICLES))
-    xyxy = clip_extents(scaled, extents[seen])
+    xyxy = clip_extents(scaled, extents_of(corners[seen]))
     visible, truncated = truth.visible[seen, camera_index], truth.truncated[seen, camera_index]
     sides = xyxy[:, 2:] - xyxy[:, :2]
     cls, known, unwanted = class_columns(kinds[seen].tolist(), classes)
@@ -117,7 +117,7 @@ def _load_sample(
         source=f"{SIMULATED}/{scene.world}",
         dims_lwh=truth.dims_lwh[seen],
         alpha=wrap_angle(truth.yaw[seen] - ray_azimuth(scaled, (xyxy[:, :2] + xyxy[:, 2:]) / 2)),
-        corners_px=project_corners(scaled, truth.center[seen], truth.dims_lwh[seen], truth.yaw[seen])[0],
+        corners_px=corners[seen],
         visible=visible,
         truncated=truncated,
         center=truth.center[seen],

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from models_export.data.dataset import UNKNOWN_CONDITION
 from models_export.data.detection import VehicleSample
-from service.geometry.boxes import TANGENT_DIRECTIONS, clip_extents, scaled_extents, tangents_of
+from service.geometry.boxes import TANGENT_DIRECTIONS, clip_extents, scaled_extents, scaled_points, tangents_of
 from service.geometry.camera import Camera, ray_azimuth
 from service.geometry.transforms import Array, wrap_angle
 from service.nets.multibin import CONTEXT, crop_vehicles, crop_windows
@@ -83,7 +83,7 @@ def vehicles_of(sample: VehicleSample, max_width: int | None = None) -> list[Veh
         image, camera = sample.still.at(max_width)
     factor = np.array([image.shape[1] / width, image.shape[0] / height])
     boxes = clip_extents(camera, scaled_extents(sample.xyxy_px, factor))
-    tangents = tangents_of((sample.corners_px + 0.5) * factor - 0.5)
+    tangents = tangents_of(scaled_points(sample.corners_px, factor))
     weather = sample.labels.get("weather", UNKNOWN_CONDITION)
     rows = np.flatnonzero(~sample.ignore & sample.class_known)
     return [_cut(image, camera, boxes[row], tangents[row], sample, row, weather) for row in rows]

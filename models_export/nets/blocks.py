@@ -43,7 +43,7 @@ def conv(cin: int, cout: int, kernel: int = 3, stride: int = 1) -> nn.Sequential
 def patches(channels: int) -> nn.Sequential:
     """The pixels' first convolution: stride 4, patches that overlap by 1 px a side.
 
-    Two convolutions of stride 2 see no more and take four times as long: the first is bound by memory, not by arithmetic.
+    Two convolutions of stride 2 see no more and take longer: the first is bound by memory, not by arithmetic.
     """
     return nn.Sequential(nn.Conv2d(3, channels, 6, 4, 1, bias=False), nn.BatchNorm2d(channels), nn.ReLU(inplace=True))
 

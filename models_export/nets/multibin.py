@@ -11,8 +11,9 @@ from torch.nn import functional
 
 from models_export.nets.blocks import Normalise, conv, patches, stage
 from service.geometry.boxes import TANGENT_DEGREES
+from service.nets.multibin import EDGES
 
-OUTLINE_READINGS = 4 + len(TANGENT_DEGREES)
+OUTLINE_READINGS = EDGES + len(TANGENT_DEGREES)
 """Edges and tangents."""
 SIGMA_UNITS = (0.05, 0.1, 0.1, 0.1, *(0.01,) * OUTLINE_READINGS)
 """Usual errors of ``UNCERTAIN`` and the tangents: training counts in them, so that all weigh alike. Radians, metres, sides of

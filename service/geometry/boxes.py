@@ -109,13 +109,19 @@ def project_extents(camera: Camera, center: ArrayLike, dims_lwh: ArrayLike, yaw:
     in_front is False the extents are not meaningful.
     """
     pixels, in_front = project_corners(camera, center, dims_lwh, yaw)
-    return np.concatenate([pixels.min(axis=-2), pixels.max(axis=-2)], -1), in_front
+    return extents_of(pixels), in_front
 
 
 def project_corners(camera: Camera, center: ArrayLike, dims_lwh: ArrayLike, yaw: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
     """Corners (N, 8, 2) of boxes in a camera, px, in the order of ``CORNER_SIGNS``, and in_front (N,) as above."""
     corners_cam = transform_points(camera.T_cam_world, box_corners(center, dims_lwh, yaw))
     return camera.project_cam(corners_cam), np.all(corners_cam[..., 2] > MIN_DEPTH_M, axis=-1)
+
+
+def extents_of(points: ArrayLike) -> Array:
+    """Extents (..., 4: left, top, right, bottom) of points (..., P, 2)."""
+    points = np.asarray(points, dtype=np.float64)
+    return np.concatenate([points.min(-2), points.max(-2)], -1)
 
 
 def tangents_of(points_px: ArrayLike) -> Array:
@@ -137,7 +143,12 @@ def cut_edges(camera: Camera, xyxy_px: ArrayLike, border_px: float = BORDER_PX) 
 
 def scaled_extents(xyxy_px: ArrayLike, factor: ArrayLike) -> Array:
     """2D boxes (N, 4) in an image ``factor`` (2,) times as wide and high; pixel centres lie at integers."""
-    scaled: Array = (np.asarray(xyxy_px, dtype=np.float64) + 0.5) * np.tile(np.asarray(factor, dtype=np.float64), 2) - 0.5
+    return scaled_points(xyxy_px, np.tile(np.asarray(factor, dtype=np.float64), 2))
+
+
+def scaled_points(points_px: ArrayLike, factor: ArrayLike) -> Array:
+    """Coordinates (..., D) in an image ``factor`` (D,) times as large; pixel centres lie at integers."""
+    scaled: Array = (np.asarray(points_px, dtype=np.float64) + 0.5) * np.asarray(factor, dtype=np.float64) - 0.5
     return scaled
 
 
