@@ -28,8 +28,9 @@ from service.frames import FrameSet
 from service.nets.pack import Pack, load_pack
 from service.nets.providers import Provider
 from service.pipeline import Pipeline, SetResult
-from service.scheduler import Scheduler
-from service.settings import usable_cores
+from service.runners import make_runner
+from service.scheduler import Scheduler, StoppableRunner
+from service.settings import Settings, usable_cores
 from service.site import load_site
 
 console = Console(stderr=True)
@@ -40,7 +41,7 @@ BARE_SHARE = 0.5
 
 
 class Via(StrEnum):
-    """How frame sets reach the pipeline."""
+    """How frame sets reach the workers."""
 
     INPROC = "inproc"
     HTTP = "http"
@@ -70,7 +71,7 @@ def measure(pack: Pack, sets: Sequence[FrameSet], seconds: float, via: Via, work
     pipeline.warm_up()
     bare = BareLoop(pipeline, sets)
     ours, bare_sets, bare_seconds = Measured(), 0, 0.0
-    with _way(pack, pipeline, sets, via, workers) as run:
+    with _way(pack, sets, via, workers) as run:
         run(min(1.0, seconds / ROUNDS), Measured())
         for _ in range(ROUNDS):
             run(seconds / ROUNDS, ours)
@@ -80,9 +81,7 @@ def measure(pack: Pack, sets: Sequence[FrameSet], seconds: float, via: Via, work
 
 
 @contextmanager
-def _way(
-    pack: Pack, pipeline: Pipeline, sets: Sequence[FrameSet], via: Via, workers: int
-) -> Iterator[Callable[[float, Measured], None]]:
+def _way(pack: Pack, sets: Sequence[FrameSet], via: Via, workers: int) -> Iterator[Callable[[float, Measured], None]]:
     if via is not Via.INPROC:
         # Needs the extra `clients`; the way in process does not.
         from benchmarks.served import run_http, served
@@ -92,12 +91,18 @@ def _way(
         with served(str(pack.path), pack.networks["detector"].provider, sets[0].site, workers) as url:
             yield lambda seconds, into: run(url, sets, seconds, workers + 1, into)
         return
-    scheduler = Scheduler(pipeline, workers=workers)
+    runner = make_runner(
+        Settings(pack=str(pack.path), provider=pack.networks["detector"].provider, workers=workers, log_level="warning")
+    )
+    scheduler = Scheduler(runner, workers=workers)
     endless = itertools.cycle(sets)
     try:
+        runner.warm_up()
         yield lambda seconds, into: run_inproc(scheduler, endless, seconds, workers + 1, into)
     finally:
         scheduler.stop()
+        if isinstance(runner, StoppableRunner):
+            runner.close()
 
 
 def report(ours: Measured, bare: float, target: float, pack: str, provider: str, via: Via, cameras: int) -> dict[str, Any]:
@@ -150,10 +155,10 @@ def bench_fps(
     pack: Annotated[str, typer.Option(help="Pack: a shipped one's name, or a folder.")] = "edge",
     provider: Annotated[Provider, typer.Option(help="What the networks compute on.")] = "auto",
     via: Annotated[
-        Via, typer.Option(help="In process, or through a served process on loopback: POST or streams.")
+        Via, typer.Option(help="Straight to the service's workers, or through a served process on loopback: POST or streams.")
     ] = Via.INPROC,
     target: Annotated[float, typer.Option(help="Exit with 1 below this many sets a second.")] = 30.0,
-    workers: Annotated[int | None, typer.Option(min=1, help="Worker threads; the usable cores if left out.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Workers; the usable cores if left out.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Replay the shipped clip as fast as it goes and compare with a target, 30 sets a second by default."""

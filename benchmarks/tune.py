@@ -16,11 +16,11 @@ from benchmarks.clip_sets import clip_frame_sets
 from benchmarks.machine import describe_machine
 from clients.clip import ClipError
 from service.errors import QuadliftError
-from service.nets.pack import load_pack
 from service.nets.providers import Provider
-from service.pipeline import Pipeline
-from service.settings import usable_cores
-from service.tuning import Trial, best, candidates, measure, with_settings
+from service.runners import make_runner
+from service.scheduler import FrameSetRunner
+from service.settings import Settings, usable_cores
+from service.tuning import Candidate, Trial, best, candidates, measure, with_settings
 
 out = Console()
 console = Console(stderr=True)
@@ -83,10 +83,11 @@ def tune(
 ) -> None:
     """Measure ways to use the cores, in turns, and give the settings of the best one."""
 
-    def load(threads: int) -> Pipeline:
-        pipeline = Pipeline(load_pack(pack, provider=provider, intra_op_threads=threads))
-        pipeline.warm_up()
-        return pipeline
+    def load(candidate: Candidate) -> FrameSetRunner:
+        workers, threads = candidate.workers, candidate.intra_op_threads
+        runner = make_runner(Settings(pack=pack, provider=provider, workers=workers, intra_op_threads=threads))
+        runner.warm_up()
+        return runner
 
     try:
         sets = clip_frame_sets(cameras=cameras)

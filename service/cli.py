@@ -56,7 +56,7 @@ def serve(
     site: Annotated[list[Path] | None, typer.Option(help="Site file to load; may be given several times.")] = None,
     pack: Annotated[str | None, typer.Option(help="Networks to run: a shipped pack's name or a folder.")] = None,
     provider: Annotated[Provider | None, typer.Option(help="What the networks compute on.")] = None,
-    workers: Annotated[int | None, typer.Option(help="Threads that run frame sets.")] = None,
+    workers: Annotated[int | None, typer.Option(help="Workers that run frame sets side by side.")] = None,
     data_dir: Annotated[Path | None, typer.Option(help="Folder that keeps the sites across restarts.")] = None,
     viewer: Annotated[bool | None, typer.Option(help="Serve the viewer page.")] = None,
 ) -> None:

@@ -1,6 +1,7 @@
 """Runs frame sets on a few worker threads, behind a bounded queue that is fair between sites, with a deadline.
 
-The networks release the interpreter lock, so each worker keeps one core busy. What cannot be run in time is refused at
+Workers are threads here; each hands its frame set to a process of its own, or runs the networks itself (settings,
+``worker_kind``). What cannot be run in time is refused at
 once (OverloadError, counted by reason); what a worker has begun is finished, unless it hangs. Sets are run one by one:
 on two cores a network run over the frames of several sites is no faster (docs/operations.md has the figures).
 """
@@ -13,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from service.errors import OverloadError, QuadliftError
 from service.fair_queue import FairQueue, Job
@@ -21,6 +22,7 @@ from service.frames import FrameSet
 from service.logs import on_behalf_of
 from service.run_limit import RunLimit
 from service.telemetry import Drop, Telemetry
+from service.worker_processes import WorkerDiedError
 from service.workers import WorkerPool
 
 if TYPE_CHECKING:
@@ -43,6 +45,19 @@ class FrameSetRunner(Protocol):
 
     def warm_up(self) -> None:
         """Run everything once, so that the first real frame set is as quick as the next."""
+        ...
+
+
+@runtime_checkable
+class StoppableRunner(FrameSetRunner, Protocol):
+    """A runner whose work can be broken off."""
+
+    def give_up(self, frame_set: FrameSet) -> None:
+        """Break off a frame set that is being run: its ``run`` ends soon, with an error."""
+        ...
+
+    def close(self) -> None:
+        """End for good."""
         ...
 
 
@@ -83,7 +98,13 @@ class Scheduler:
         self._stopping = False
         self._idle = 0
         self._pool = WorkerPool(
-            self._next, self._run, size=workers, max_abandoned=max_abandoned, telemetry=self._telemetry, clock=clock
+            self._next,
+            self._run,
+            runner.give_up if isinstance(runner, StoppableRunner) else None,
+            size=workers,
+            max_abandoned=max_abandoned,
+            telemetry=self._telemetry,
+            clock=clock,
         )
         self._ended = threading.Event()
         self._watch = threading.Thread(target=self._watch_over, name="quadlift-watch", daemon=True)
@@ -221,6 +242,9 @@ class Scheduler:
                 result = self._runner.run(job.frame_set)
             except QuadliftError as error:
                 job.fail(error)
+            except WorkerDiedError:
+                # The pool answers for it.
+                raise
             except Exception:
                 # Whatever a network does must not end the worker, nor tell the caller about our insides.
                 logger.exception("A frame set of site '%s' failed", job.site_id, extra={"site": job.site_id})

@@ -49,7 +49,11 @@ class Settings(BaseSettings):
     """Site files to load at start; each replaces a kept site of the same id."""
 
     workers: Annotated[int, Field(ge=1, le=256)] = Field(default_factory=usable_cores)
-    """Threads that run frame sets. Default: the usable cores. ``quadlift tune`` measures what is best."""
+    """Workers that run frame sets side by side. Default: the usable cores. ``quadlift tune`` measures what is best."""
+    worker_kind: Literal["process", "thread"] = "process"
+    """Whether workers are processes or threads of the service. Threads share one copy of the networks, which spares a GPU's
+    memory, and the interpreter lock, which costs a CPU a quarter of its frame sets (docs/operations.md); one that hangs
+    cannot be killed."""
     intra_op_threads: Annotated[int, Field(ge=1, le=256)] = 1
     """Threads inside the networks for each worker."""
     queue_size: Annotated[int, Field(ge=1)] = 16

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from service.errors import InputError
 from service.frames import FrameSet
-from service.scheduler import FrameSetRunner, Scheduler
+from service.scheduler import FrameSetRunner, Scheduler, StoppableRunner
 
 if TYPE_CHECKING:
     from service.pipeline import SetResult
@@ -64,12 +65,12 @@ def candidates(cores: int) -> list[Candidate]:
     found = {
         Candidate(workers, threads) for workers, threads in itertools.product(counts, counts) if workers * threads <= cores
     }
-    # While one worker waits for the interpreter, another one may use its core.
+    # While one worker's answer is on its way, another one may use its core.
     return sorted(found | {Candidate(cores + 1, 1)})
 
 
 def measure(
-    load: Callable[[int], FrameSetRunner],
+    load: Callable[[Candidate], FrameSetRunner],
     frame_sets: Sequence[FrameSet],
     tried: Sequence[Candidate],
     seconds: float,
@@ -77,14 +78,19 @@ def measure(
 ) -> list[Trial]:
     """Run the candidates in turns for about ``seconds`` together, loading aside; gives one trial each, in their order.
 
-    load: a warm pipeline with so many threads in its networks; asked once for each number.
+    load: what a service would run frame sets with, warm; asked once for each candidate.
     """
-    runners = {threads: load(threads) for threads in sorted({candidate.intra_op_threads for candidate in tried})}
     trials = [Trial(candidate) for candidate in tried]
     sets = itertools.cycle(frame_sets)
-    for _ in range(ROUNDS):
-        for trial in trials:
-            _take_turn(trial, runners[trial.candidate.intra_op_threads], sets, seconds / ROUNDS / len(trials), clock)
+    with ExitStack() as stack:
+        runners = []
+        for candidate in tried:
+            runners.append(runner := load(candidate))
+            if isinstance(runner, StoppableRunner):
+                stack.callback(runner.close)
+        for _ in range(ROUNDS):
+            for trial, runner in zip(trials, runners, strict=True):
+                _take_turn(trial, runner, sets, seconds / ROUNDS / len(trials), clock)
     return trials
 
 

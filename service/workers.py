@@ -1,7 +1,8 @@
 """Threads that run frame sets, and their supervision: one that hangs or dies is replaced.
 
 A thread cannot be killed. One that hangs is abandoned: its frame set is answered with an error, another thread takes its
-place, and what it brings in the end, if anything, is thrown away. Only so many may hang at a time.
+place, and what it brings in the end, if anything, is thrown away. Only so many may hang at a time. One that waits for a
+process comes back at once, since that can be killed.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from dataclasses import dataclass, field
 
 from service.errors import QuadliftError, RunTimeoutError
 from service.fair_queue import Job
+from service.frames import FrameSet
 from service.telemetry import Drop, Restart, Telemetry
 
 logger = logging.getLogger(__name__)
@@ -35,6 +37,7 @@ class WorkerPool:
         self,
         take: Callable[[], Job | None],
         run: Callable[[Job], None],
+        give_up: Callable[[FrameSet], None] | None = None,
         *,
         size: int,
         max_abandoned: int,
@@ -44,10 +47,12 @@ class WorkerPool:
         """Start the workers.
 
         take: waits for the next job; None ends the worker. run: answers a job; whatever it raises ends the worker, which is
-        replaced. max_abandoned: threads that may hang while others do their work; beyond that the pool shrinks.
+        replaced. give_up: breaks off what a worker that hangs is doing. max_abandoned: threads that may hang while others do
+        their work; beyond that the pool shrinks.
         """
         self._take = take
         self._run = run
+        self._give_up = give_up
         self._size = size
         self._wanted = size
         self._max_abandoned = max_abandoned
@@ -158,6 +163,8 @@ class WorkerPool:
         self._telemetry.restarted(Restart.HUNG)
         if job.fail(RunTimeoutError(took_s)):
             self._telemetry.dropped(Drop.HUNG)
+        if self._give_up is not None:
+            self._give_up(job.frame_set)
 
     def _ended(self, worker: _Worker, cause: BaseException | None) -> None:
         with self._lock:

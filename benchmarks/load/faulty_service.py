@@ -7,6 +7,7 @@ that site, once.
 from __future__ import annotations
 
 import os
+import signal
 import time
 from enum import StrEnum
 from pathlib import Path
@@ -28,7 +29,7 @@ class NetworkFault(StrEnum):
     RAISE = "raise"
     HANG = "hang"
     KILL = "kill"
-    """Ends the worker's thread, as an error does that no handler knows."""
+    """Ends the worker's process, as the system does when memory runs out."""
 
 
 class FaultyRunner:
@@ -46,7 +47,7 @@ class FaultyRunner:
         if fault is NetworkFault.HANG:
             time.sleep(HANG_S)
         if fault is NetworkFault.KILL:
-            raise SystemExit("an injected end of the worker")
+            os.kill(os.getpid(), signal.SIGKILL)
         return self._runner.run(frame_set)
 
     def warm_up(self) -> None:
@@ -56,7 +57,7 @@ class FaultyRunner:
     def _claim(self, site_id: str) -> NetworkFault | None:
         for fault in NetworkFault:
             try:
-                # Only one thread can remove it.
+                # Only one worker can remove it.
                 fault_file(self._folder, site_id, fault).unlink()
             except FileNotFoundError:
                 continue
@@ -69,16 +70,18 @@ def fault_file(folder: Path, site_id: str, fault: NetworkFault) -> Path:
     return folder / f"{site_id}.{fault}"
 
 
+def load_faulty(settings: Settings) -> FrameSetRunner:
+    """The service's pipeline, wrapped; in a worker process."""
+    from service.runners import load_pipeline
+
+    return FaultyRunner(load_pipeline(settings), Path(os.environ[FOLDER_VARIABLE]))
+
+
 def main() -> None:
-    """``quadlift serve`` with the pipeline wrapped."""
+    """``quadlift serve`` with workers that run the wrapped pipeline."""
     import service.api.app as app
     from service.cli import main as serve
+    from service.runners import make_runner
 
-    folder = Path(os.environ[FOLDER_VARIABLE])
-    own = app.default_pipeline
-
-    def faulty(settings: Settings) -> FrameSetRunner:
-        return FaultyRunner(own(settings), folder)
-
-    app.default_pipeline = faulty
+    app.default_pipeline = lambda settings: make_runner(settings, load_faulty)
     serve()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import replace
 
 from fastapi import FastAPI
 
@@ -19,9 +18,9 @@ from service.api.live import LiveSites, TrackerFactory, default_tracker
 from service.api.loop_lag import watch_loop
 from service.api.recent import RecentFrames
 from service.api.request_ids import RequestIds
-from service.api.state import Service
+from service.api.state import Service, in_daemon_thread
 from service.errors import CalibrationError
-from service.scheduler import FrameSetRunner, Scheduler
+from service.scheduler import FrameSetRunner, Scheduler, StoppableRunner
 from service.settings import Settings
 from service.site import load_site
 from service.sites_store import SitesStore
@@ -86,6 +85,8 @@ def create_app(
             warming.cancel()
             watching.cancel()
             await asyncio.gather(warming, watching, return_exceptions=True)
+            if isinstance(runner, StoppableRunner):
+                await in_daemon_thread(runner.close)
 
     app = FastAPI(title="Quadlift", version=__version__, description=_DESCRIPTION, lifespan=lifespan, redoc_url=None)
     app.add_middleware(Access, tokens=tokens, allowed_origins=settings.allowed_origins)
@@ -102,14 +103,9 @@ def create_app(
 
 def default_pipeline(settings: Settings) -> FrameSetRunner:
     """The service's own pipeline on the pack that the settings name. Raises PackError or InputError."""
-    from service.nets.pack import load_pack
-    from service.pipeline import Pipeline, PipelineSettings
+    from service.runners import make_runner
 
-    options = PipelineSettings(hard_mode=settings.hard_mode)
-    if (threshold := settings.score_threshold) is not None:
-        options = replace(options, score_threshold=threshold, min_fused_score=threshold)
-    pack = load_pack(settings.pack, provider=settings.provider, intra_op_threads=settings.intra_op_threads)
-    return Pipeline(pack, options)
+    return make_runner(settings)
 
 
 def open_store(settings: Settings) -> SitesStore:

@@ -54,15 +54,15 @@ def test_two_cores() -> None:
 
 def test_a_known_rate_is_found_in_the_time_that_was_given() -> None:
     clock = Clock()
-    runners = {1: Runner(clock, 0.02), 2: Runner(clock, 0.01)}
+    runners = {Candidate(1, 1): Runner(clock, 0.02), Candidate(1, 2): Runner(clock, 0.01)}
     asked = []
 
-    def load(threads: int) -> Runner:
-        asked.append(threads)
-        return runners[threads]
+    def load(candidate: Candidate) -> Runner:
+        asked.append(candidate)
+        return runners[candidate]
 
-    trials = measure(load, SETS, [Candidate(1, 1), Candidate(1, 2)], 8.0, clock)
-    assert asked == [1, 2]
+    trials = measure(load, SETS, list(runners), 8.0, clock)
+    assert asked == list(runners)
     assert [t.sets_per_second for t in trials] == [pytest.approx(50), pytest.approx(100)]
     assert [t.latency_percentile_ms(99) for t in trials] == [pytest.approx(20), pytest.approx(10)]
     assert clock.now == pytest.approx(8.0, abs=0.2)

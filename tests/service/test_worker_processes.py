@@ -1,0 +1,182 @@
+"""Worker processes: answers, errors and sites find their way; a process that hangs or dies is replaced."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.errors import FrameError, PackError, QuadliftError
+from service.frames import EncodedFrame, FrameSet
+from service.geometry.camera import Camera
+from service.geometry.ground import GroundPlane
+from service.run_limit import RunLimit
+from service.scheduler import Scheduler, StoppableRunner
+from service.site import Site
+from service.telemetry import Telemetry
+from service.worker_processes import ProcessRunner, WorkerDiedError
+
+
+@pytest.fixture
+def scripted(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The module of the runner, where processes find it."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    return importlib.import_module("scripted_worker")
+
+
+@pytest.fixture
+def start(scripted: Any) -> Iterator[Callable[..., ProcessRunner]]:
+    runners: list[ProcessRunner] = []
+
+    def build(size: int = 1) -> ProcessRunner:
+        runners.append(ProcessRunner(scripted.Scripted, size))
+        return runners[-1]
+
+    yield build
+    for runner in runners:
+        runner.close()
+
+
+def site(camera: str = "north") -> Site:
+    K = np.array([[800.0, 0, 320], [0, 800, 180], [0, 0, 1]])
+    return Site("demo", (Camera(camera, 640, 360, K, np.zeros(0), np.eye(4)),), GroundPlane())
+
+
+HERE = site()
+
+
+def asking(words: str, at: Site = HERE) -> FrameSet:
+    return FrameSet(at, (EncodedFrame("north", words.encode(), None),), 0, 1)
+
+
+def until(condition: Callable[[], bool], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited too long"
+        time.sleep(0.01)
+
+
+def test_frame_sets_are_run_in_other_processes_all_of_them_warm(start: Callable[..., ProcessRunner]) -> None:
+    runner = start(2)
+    assert isinstance(runner, StoppableRunner)
+    runner.warm_up()
+    seen: list[Any] = []
+    threads = [threading.Thread(target=lambda: seen.append(runner.run(asking("pid")))) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(seen) == 8
+    assert {warm for _, warm in seen} == {1}
+    assert os.getpid() not in {pid for pid, _ in seen}
+
+
+def test_a_site_is_sent_once_and_again_when_it_changed(start: Callable[..., ProcessRunner]) -> None:
+    runner, moved = start(), site("east")
+    seen: list[Any] = [runner.run(asking("site", at)) for at in (HERE, HERE, moved, moved, HERE)]
+    assert seen == [("north", False), ("north", True), ("east", False), ("east", True), ("north", False)]
+
+
+def test_errors_come_back_whole_and_the_process_goes_on(start: Callable[..., ProcessRunner]) -> None:
+    runner = start()
+    with pytest.raises(FrameError) as caught:
+        runner.run(asking("frame-error"))
+    assert (caught.value.message, caught.value.field, caught.value.remedy) == ("not a JPEG.", "north", "Send one.")
+    with pytest.raises(RuntimeError, match="OddError: 1 and 2") as other:
+        runner.run(asking("odd-error"))
+    assert "raise OddError(1, 2)" in "".join(other.value.__notes__)
+    assert runner.run(asking("")) == "done"
+
+
+def test_what_cannot_be_loaded_is_said_at_the_start(scripted: Any) -> None:
+    with pytest.raises(PackError, match="is missing"):
+        ProcessRunner(scripted.refuse, 2)
+
+
+def test_a_process_that_dies_is_replaced_by_a_warm_one(start: Callable[..., ProcessRunner]) -> None:
+    runner = start()
+    first, _ = runner.run(asking("pid"))  # type: ignore[misc]
+    with pytest.raises(WorkerDiedError, match="-9"):
+        runner.run(asking("die"))
+    second, warm = runner.run(asking("pid"))  # type: ignore[misc]
+    assert second != first
+    assert warm == 1
+
+
+def test_what_hangs_is_given_up_and_so_is_what_waits_for_it(start: Callable[..., ProcessRunner]) -> None:
+    runner, ends = start(), list[str]()
+
+    def run(frame_set: FrameSet) -> None:
+        try:
+            runner.run(frame_set)
+        except WorkerDiedError as error:
+            ends.append(str(error))
+
+    hanging, waiting = asking("hang"), asking("hang")
+    threads = [threading.Thread(target=run, args=(each,)) for each in (hanging, waiting)]
+    threads[0].start()
+    until(lambda: runner._running.get(hanging) is not None)
+    threads[1].start()
+    until(lambda: waiting in runner._running)
+    runner.give_up(waiting)
+    threads[1].join(5)
+    runner.give_up(hanging)
+    threads[0].join(5)
+    assert len(ends) == 2
+    assert "in time" in ends[0]
+    # Of a set that is over nothing is left to give up.
+    runner.give_up(hanging)
+    assert runner.run(asking("")) == "done"
+
+
+def test_a_process_that_ends_at_its_start_is_an_error(scripted: Any) -> None:
+    with pytest.raises(QuadliftError, match="ended at its start"):
+        ProcessRunner(scripted.end, 1)
+
+
+def test_processes_end_with_their_owner(scripted: Any, tmp_path: Path) -> None:
+    log = tmp_path / "pid"
+    runner = ProcessRunner(partial(scripted.noted, log), 1)
+    pid = int(log.read_text())
+    runner.close()
+    until(lambda: not Path(f"/proc/{pid}").exists() if Path("/proc").exists() else True)
+    with pytest.raises(WorkerDiedError):
+        runner.run(asking(""))
+
+
+def test_signals_to_the_whole_group_do_not_end_work_under_way(start: Callable[..., ProcessRunner], tmp_path: Path) -> None:
+    runner, begun, seen = start(), tmp_path / "begun", list[Any]()
+    pid, _ = runner.run(asking("pid"))  # type: ignore[misc]
+    thread = threading.Thread(target=lambda: seen.append(runner.run(asking(f"wait {begun}"))))
+    thread.start()
+    until(begun.exists)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        os.kill(pid, number)
+    thread.join(10)
+    assert seen == ["done"]
+
+
+def test_the_scheduler_answers_for_processes(start: Callable[..., ProcessRunner]) -> None:
+    telemetry = Telemetry()
+    scheduler = Scheduler(start(), workers=1, run_limit=RunLimit(0.2), telemetry=telemetry, deadline_s=30, max_abandoned=0)
+    try:
+        hung, died, good = (scheduler.enqueue(asking(words)) for words in ("hang", "die", ""))
+        with pytest.raises(Exception, match="had not finished"):
+            hung.result(20)
+        scheduler.run_limit = RunLimit(30)
+        with pytest.raises(Exception, match="the worker died"):
+            died.result(20)
+        assert good.result(20) == "done"
+        assert telemetry.drops()["hung"] == telemetry.drops()["failed"] == 1
+        until(lambda: scheduler.trouble() is None)
+    finally:
+        scheduler.stop()
