@@ -14,6 +14,7 @@ from typing import Any
 import httpx
 from prometheus_client.parser import text_string_to_metric_families
 
+from benchmarks.load.process_tree import tree_rss_bytes
 from clients.client import AsyncClient
 from clients.local_service import HOST, SERVE, free_port, running_service
 from service.site import parse_site, save_site
@@ -32,12 +33,8 @@ class Target:
 
     @property
     def rss_bytes(self) -> int:
-        """Resident memory of the process; 0 when it has ended."""
-        try:
-            text = Path(f"/proc/{self.process.pid}/status").read_text("ascii")
-        except OSError:
-            return 0
-        return next((1024 * int(line.split()[1]) for line in text.splitlines() if line.startswith("VmRSS:")), 0)
+        """Resident memory of the process and of those that it started; 0 when it has ended."""
+        return tree_rss_bytes(self.process.pid)
 
 
 @dataclass(frozen=True)
