@@ -87,13 +87,19 @@ def _way(pack: Pack, sets: Sequence[FrameSet], via: Via, workers: int) -> Iterat
         from benchmarks.served import run_http, served
         from benchmarks.streamed import run_ws
 
-        run = run_ws if via is Via.WS else run_http
+        run_served = run_ws if via is Via.WS else run_http
         with served(str(pack.path), pack.networks["detector"].provider, sets[0].site, workers) as url:
-            yield lambda seconds, into: run(url, sets, seconds, workers + 1, into)
+            yield lambda seconds, into: run_served(url, sets, seconds, workers + 1, into)
         return
-    runner = make_runner(
-        Settings(pack=str(pack.path), provider=pack.networks["detector"].provider, workers=workers, log_level="warning")
-    )
+    with in_process(pack, sets, workers) as run_workers:
+        yield run_workers
+
+
+@contextmanager
+def in_process(pack: Pack, sets: Sequence[FrameSet], workers: int) -> Iterator[Callable[[float, Measured], None]]:
+    """What runs a service's workers, without its server, for so many seconds, with one set more under way than there are workers."""
+    provider = pack.networks["detector"].provider
+    runner = make_runner(Settings(pack=str(pack.path), provider=provider, workers=workers, log_level="warning"))
     scheduler = Scheduler(runner, workers=workers)
     endless = itertools.cycle(sets)
     try:

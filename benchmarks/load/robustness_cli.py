@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
-import math
 import signal
 from typing import Annotated, Any
 
@@ -16,7 +14,7 @@ from benchmarks.load.faults import SIGTERM, FaultResult, run_faults
 from benchmarks.load.injections import KINDS
 from benchmarks.load.parser_fuzz import fuzz_parsers
 from benchmarks.load.readers import UNREACHABLE, measure_readers
-from benchmarks.machine import describe_machine
+from benchmarks.load.report import Json, finish
 from clients.client import ServiceError
 from clients.clip import ClipError
 from clients.local_service import LocalServiceError
@@ -24,8 +22,6 @@ from clients.local_service import LocalServiceError
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__)
 console = Console(stderr=True)
 PARSERS = "parsers"
-
-Json = Annotated[bool, typer.Option("--json", help="Print JSON alone.")]
 
 
 @app.command()
@@ -41,7 +37,7 @@ def readers(
     except (LocalServiceError, ServiceError, ClipError, *UNREACHABLE) as error:
         console.print(f"[red]{type(error).__name__}: {error}[/red]")
         raise typer.Exit(2) from None
-    _finish(figures, as_json, passed=figures["passed"])
+    finish(figures, as_json, passed=figures["passed"])
 
 
 @app.command()
@@ -60,7 +56,7 @@ def faults(
 
     results = asyncio.run(run_faults(chosen, times, seconds, say))
     figures = {"faults": [result.document() for result in results]}
-    _finish(figures, as_json, passed=all(result.passed for result in results))
+    finish(figures, as_json, passed=all(result.passed for result in results))
 
 
 @app.command()
@@ -78,7 +74,7 @@ def attacks(
     if PARSERS in chosen:
         parsers = fuzz_parsers(runs, fuzz_seconds, seed)
         figures[PARSERS] = parsers | {"passed": not parsers["crashes"]}
-    _finish(figures, as_json, passed=all(part["passed"] for part in figures.values()))
+    finish(figures, as_json, passed=all(part["passed"] for part in figures.values()))
 
 
 def _chosen(wanted: list[str] | None, known: list[str]) -> list[str]:
@@ -87,26 +83,6 @@ def _chosen(wanted: list[str] | None, known: list[str]) -> list[str]:
         console.print(f"[red]{', '.join(sorted(strange))}: not one of {', '.join(known)}[/red]")
         raise typer.Exit(2)
     return [name for name in known if not wanted or name in wanted]
-
-
-def _finish(figures: dict[str, Any], as_json: bool, *, passed: bool) -> None:
-    """Print, and end with 1 where a limit was not kept."""
-    figures = _plain(figures | {"machine": describe_machine(), "passed": passed})
-    if as_json:
-        typer.echo(json.dumps(figures, indent=1))
-    else:
-        Console().print_json(data=figures)
-    if not passed:
-        raise typer.Exit(1)
-
-
-def _plain(value: Any) -> Any:
-    """The same without NaN and infinities, which JSON has not: what could not be measured is null."""
-    if isinstance(value, dict):
-        return {key: _plain(part) for key, part in value.items()}
-    if isinstance(value, list):
-        return [_plain(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def main() -> None:

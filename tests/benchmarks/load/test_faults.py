@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections import Counter
 from pathlib import Path
 
@@ -99,7 +101,14 @@ class Recorder:
 
 
 @pytest.mark.parametrize(("fault", "error"), [(NetworkFault.RAISE, RuntimeError), (NetworkFault.KILL, SystemExit)])
-def test_a_fault_strikes_its_own_site_once(tmp_path: Path, fault: NetworkFault, error: type[BaseException]) -> None:
+def test_a_fault_strikes_its_own_site_once(
+    tmp_path: Path, fault: NetworkFault, error: type[BaseException], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def end(pid: int, number: int) -> None:
+        assert (pid, number) == (os.getpid(), signal.SIGKILL)
+        raise SystemExit
+
+    monkeypatch.setattr("benchmarks.load.faulty_service.os.kill", end)
     networks = Recorder()
     runner = FaultyRunner(networks, tmp_path)
     fault_file(tmp_path, "struck", fault).touch()
