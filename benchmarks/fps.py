@@ -97,7 +97,7 @@ def _way(pack: Pack, sets: Sequence[FrameSet], via: Via, workers: int) -> Iterat
 
 @contextmanager
 def in_process(pack: Pack, sets: Sequence[FrameSet], workers: int) -> Iterator[Callable[[float, Measured], None]]:
-    """What runs a service's workers, without its server, for so many seconds, with one set more under way than there are workers."""
+    """What keeps a service's workers busy, without its server, for so many seconds: one set more is under way than they run."""
     provider = pack.networks["detector"].provider
     runner = make_runner(Settings(pack=str(pack.path), provider=provider, workers=workers, log_level="warning"))
     scheduler = Scheduler(runner, workers=workers)
