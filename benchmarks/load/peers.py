@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Awaitable, Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -185,10 +186,10 @@ def _starts(site_file: Path) -> Iterator[Callable[[], Any]]:
     cores = usable_cores()
     yield _ours
     many, one = ["--processes", str(cores), "--threads", "1"], ["--processes", "1", "--threads", str(cores)]
-    yield lambda: _peer("fastapi", "peer_fastapi", many, site_file)
-    yield lambda: _peer("fastapi threads", "peer_fastapi", one, site_file)
-    yield lambda: _peer("litserve", "peer_litserve", ["--processes", str(cores)], site_file)
-    yield lambda: _peer("mosec", "peer_mosec", ["--processes", str(cores)], site_file)
+    yield lambda: peer("fastapi", "peer_fastapi", many, site_file)
+    yield lambda: peer("fastapi threads", "peer_fastapi", one, site_file)
+    yield lambda: peer("litserve", "peer_litserve", ["--processes", str(cores)], site_file)
+    yield lambda: peer("mosec", "peer_mosec", ["--processes", str(cores)], site_file)
 
 
 @contextmanager
@@ -200,7 +201,8 @@ def _ours() -> Iterator[Contender]:
 
 
 @contextmanager
-def _peer(name: str, module: str, options: Sequence[str], site_file: Path) -> Iterator[Contender]:
+def peer(name: str, module: str, options: Sequence[str], site_file: Path) -> Iterator[Contender]:
+    """A peer's module as a process that has answered a frame set, for as long as the block runs. Raises LoadError."""
     clip, port = open_clip(), free_port(0)
     is_mosec = module == "peer_mosec"
     address = ["--address", HOST] if is_mosec else ["--host", HOST]
@@ -222,11 +224,12 @@ def _peer(name: str, module: str, options: Sequence[str], site_file: Path) -> It
             yield Contender(name, job, process.pid)
         finally:
             process.terminate()
-            try:
+            with suppress(subprocess.TimeoutExpired):
                 process.wait(STOP_TIMEOUT_S)
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, 9)
-                process.wait()
+            # SIGTERM ends LitServe's parent alone: its workers and HTTP servers would stay for good.
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
 
 
 def _await_answer(process: subprocess.Popen[bytes], job: PostJob, log: Any) -> None:
