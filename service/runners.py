@@ -8,6 +8,7 @@ from functools import partial
 
 from service.logs import configure_logging
 from service.nets.pack import load_pack
+from service.nets.providers import is_gpu
 from service.pipeline import Pipeline, PipelineSettings
 from service.scheduler import FrameSetRunner
 from service.settings import Settings
@@ -30,7 +31,7 @@ def make_runner(settings: Settings, load: Load = load_pipeline) -> FrameSetRunne
 
     load: makes the pipeline; a function of a module, since worker processes look it up by its name.
     """
-    if settings.worker_kind == "thread":
+    if settings.worker_kind == "thread" or (settings.worker_kind == "auto" and is_gpu(settings.provider)):
         return load(settings)
     return ProcessRunner(partial(_load_in_process, settings, load), settings.workers)
 

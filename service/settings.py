@@ -50,10 +50,10 @@ class Settings(BaseSettings):
 
     workers: Annotated[int, Field(ge=1, le=256)] = Field(default_factory=usable_cores)
     """Workers that run frame sets side by side. Default: the usable cores. ``quadlift tune`` measures what is best."""
-    worker_kind: Literal["process", "thread"] = "process"
+    worker_kind: Literal["auto", "process", "thread"] = "auto"
     """Whether workers are processes or threads of the service. Threads share one copy of the networks, which spares a GPU's
-    memory, and the interpreter lock, which costs a CPU a quarter of its frame sets (docs/operations.md); one that hangs
-    cannot be killed."""
+    memory, and the interpreter lock, which costs a CPU a fifth of its frame sets (docs/operations.md); one that hangs
+    cannot be killed. ``auto``: threads where the networks run on CUDA or TensorRT, else processes."""
     intra_op_threads: Annotated[int, Field(ge=1, le=256)] = 1
     """Threads inside the networks for each worker."""
     queue_size: Annotated[int, Field(ge=1)] = 16

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import onnxruntime as ort
+
 from service.errors import InputError, PackError
 
 logger = logging.getLogger(__name__)
@@ -54,6 +56,11 @@ def choose(asked: Provider, offered: Sequence[str]) -> Choice:
             remedy="Install the build of onnxruntime that has it (onnxruntime-gpu, onnxruntime-openvino), or set 'auto'.",
         )
     return Choice(asked, True)
+
+
+def is_gpu(asked: Provider) -> bool:
+    """Whether the networks of a service with this setting would run on CUDA or TensorRT. Raises InputError as :func:`choose`."""
+    return choose(asked, ort.get_available_providers()).provider in ("cuda", "tensorrt")
 
 
 def session_providers(choice: Choice, offered: Sequence[str], intra_op_threads: int) -> list[tuple[str, dict[str, str]]]:

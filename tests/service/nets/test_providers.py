@@ -10,7 +10,7 @@ import pytest
 
 from service.errors import InputError, PackError
 from service.nets.pack import load_pack
-from service.nets.providers import PROVIDERS, Choice, Provider, choose, session_providers, settled
+from service.nets.providers import PROVIDERS, Choice, Provider, choose, is_gpu, session_providers, settled
 
 CPU, CUDA, TENSORRT, OPENVINO = (f"{name}ExecutionProvider" for name in ("CPU", "CUDA", "Tensorrt", "OpenVINO"))
 OTHER = "AzureExecutionProvider"
@@ -96,3 +96,14 @@ def test_a_pack_runs_on_the_cpu_that_is_there() -> None:
     missing = next(name for name in ("tensorrt", "openvino", "cuda") if name not in str(ort.get_available_providers()).lower())
     with pytest.raises(InputError, match=f"'{missing}' is not offered"):
         load_pack("edge", provider=missing)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("asked", "offered", "expected"),
+    [("auto", [CPU], False), ("auto", [CUDA, CPU], True), ("cpu", [CUDA, CPU], False), ("tensorrt", [TENSORRT, CPU], True)],
+)
+def test_what_a_setting_would_run_on(
+    monkeypatch: pytest.MonkeyPatch, asked: Provider, offered: list[str], expected: bool
+) -> None:
+    monkeypatch.setattr(ort, "get_available_providers", lambda: offered)
+    assert is_gpu(asked) is expected
