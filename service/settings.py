@@ -75,8 +75,8 @@ class Settings(BaseSettings):
 
     max_body_bytes: Annotated[int, Field(ge=1024)] = 32 * 2**20
     """Bytes of one request's body."""
-    max_bodies_bytes: Annotated[int, Field(ge=1024)] = 64 * 2**20
-    """Bytes of all bodies that are being received together; a body for which there is no room is answered 503."""
+    max_bodies_bytes: Annotated[int, Field(ge=1024)] = 32 * 2**20
+    """Bytes of all bodies that are being received together; when they want more, the longest is answered 503."""
     body_receive_s: Annotated[float, Field(gt=0)] = 10.0
     """A request's body that has not come after this time is answered 408. Seconds."""
     max_frame_bytes: Annotated[int, Field(ge=1024)] = FrameLimits.max_frame_bytes

@@ -126,8 +126,9 @@ async def _run_one(attack: Attack, seconds: float, seed: int) -> dict[str, Any]:
         alive = target.process.poll() is None
     answered = {status: n - then.by_label("http_requests", "status").get(status, 0)
                 for status, n in now.by_label("http_requests", "status").items()}  # fmt: skip
-    failed = {status: count for status, count in answered.items() if status.startswith("5") and count}
-    failed_attack = sum(failed.values()) - sum(n for status, n in during.failures.items() if status.startswith("5"))
+    # 503 is how too much is turned away; that of the honest client counts all the same, as its failure.
+    failed = {status: count for status, count in answered.items() if status.startswith("5") and status != "503" and count}
+    failed_attack = sum(failed.values()) - sum(n for status, n in during.failures.items() if status in failed)
     figures = own | compare(before, during) | {
         "seconds": round(took_s, 1),
         "http_answers": sum(answered.values()) - during.requests,

@@ -38,7 +38,7 @@ class RawResult:
 
     def document(self) -> dict[str, Any]:
         """JSON-ready."""
-        failed = sum(count for status, count in self.statuses.items() if status >= 500)
+        failed = sum(count for status, count in self.statuses.items() if status >= 500 and status != 503)
         statuses = {str(status): count for status, count in sorted(self.statuses.items())}
         return {"cases": self.cases, "refused_connections": self.connections_refused, "statuses": statuses, "5xx": failed}
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any
 
 from python_multipart.exceptions import FormParserError
@@ -30,53 +32,79 @@ class Part:
     data: bytes
 
 
+@dataclass(eq=False)
+class _Body:
+    """A body on its way in."""
+
+    data: bytearray = field(default_factory=bytearray)
+    is_cut: bool = False
+    """It had to make room: its bytes are gone, and its sender is told with the next ones."""
+
+
 class BodyRoom:
-    """Memory for the bodies that are being received, of all requests together. Belongs to one event loop."""
+    """Memory for the bodies that are being received, of all requests together. Belongs to one event loop.
+
+    When it is full, the longest body makes room for shorter ones: whoever sends without an end cuts off nobody but itself.
+    """
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes = max_bytes
-        self.held_bytes = 0
+        self._bodies: set[_Body] = set()
 
-    def take(self, size: int) -> None:
-        """Take room for ``size`` bytes; whoever takes gives it back. Raises OverloadError when there is none."""
-        if self.held_bytes + size > self._max_bytes:
+    @property
+    def held_bytes(self) -> int:
+        """What all bodies take now."""
+        return sum(len(body.data) for body in self._bodies)
+
+    @contextmanager
+    def receiving(self) -> Iterator[_Body]:
+        """A place for one body, for as long as the block runs."""
+        body = _Body()
+        self._bodies.add(body)
+        try:
+            yield body
+        finally:
+            self._bodies.remove(body)
+
+    def add(self, body: _Body, chunk: bytes) -> None:
+        """More bytes of a body. Raises OverloadError when it is the one that has to make room."""
+        while not body.is_cut and self.held_bytes + len(chunk) > self._max_bytes:
+            longest = max(self._bodies, key=lambda other: len(other.data))
+            if len(longest.data) <= len(body.data) + len(chunk):
+                longest = body
+            longest.data = bytearray()
+            longest.is_cut = True
+        if body.is_cut:
             raise OverloadError(
-                f"{self.held_bytes} bytes of bodies are under way, and {self._max_bytes} may be.",
+                f"all bodies under way may take {self._max_bytes} bytes together, and this one was the longest.",
                 remedy="Send fewer bodies at a time, or raise QUADLIFT_MAX_BODIES_BYTES.",
             )
-        self.held_bytes += size
-
-    def give(self, size: int) -> None:
-        """Give back room that was taken."""
-        self.held_bytes -= size
+        body.data += chunk
 
 
 async def read_body(request: Request, max_bytes: int, limit_s: float, room: BodyRoom) -> bytes:
     """The request's body.
 
     Raises TooLargeError as soon as it is, or announces to be, longer than ``max_bytes``; SlowSenderError when it has not come
-    after ``limit_s`` seconds; OverloadError when all bodies under way want more than ``room``.
+    after ``limit_s`` seconds; OverloadError when there is no room for it.
     """
     announced = request.headers.get("content-length", "")
     if announced.isdecimal() and int(announced) > max_bytes:
         raise _too_long(f"{announced} bytes announced", max_bytes)
-    body = bytearray()
-    try:
-        async with asyncio.timeout(limit_s):
-            async for chunk in request.stream():
-                if len(body) + len(chunk) > max_bytes:
-                    raise _too_long("more bytes", max_bytes)
-                room.take(len(chunk))
-                body += chunk
-    except TimeoutError:
-        raise SlowSenderError(
-            f"{len(body)} bytes came within {limit_s:g} s, and not the end.",
-            field="body",
-            remedy="Send faster, compress the frames more, or raise QUADLIFT_BODY_RECEIVE_S.",
-        ) from None
-    finally:
-        room.give(len(body))
-    return bytes(body)
+    with room.receiving() as body:
+        try:
+            async with asyncio.timeout(limit_s):
+                async for chunk in request.stream():
+                    if len(body.data) + len(chunk) > max_bytes:
+                        raise _too_long("more bytes", max_bytes)
+                    room.add(body, chunk)
+        except TimeoutError:
+            raise SlowSenderError(
+                f"{len(body.data)} bytes came within {limit_s:g} s, and not the end.",
+                field="body",
+                remedy="Send faster, compress the frames more, or raise QUADLIFT_BODY_RECEIVE_S.",
+            ) from None
+        return bytes(body.data)
 
 
 def parse_json(body: bytes) -> Any:

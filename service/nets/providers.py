@@ -59,7 +59,7 @@ def choose(asked: Provider, offered: Sequence[str]) -> Choice:
 
 
 def is_gpu(asked: Provider) -> bool:
-    """Whether the networks of a service with this setting would run on CUDA or TensorRT. Raises InputError as :func:`choose`."""
+    """Whether the networks would run on CUDA or TensorRT with this setting. Raises InputError as :func:`choose` does."""
     return choose(asked, ort.get_available_providers()).provider in ("cuda", "tensorrt")
 
 

@@ -36,16 +36,33 @@ async def received(room: BodyRoom, *chunks: bytes) -> bytes:
     return await read_body(posted(*chunks), 100, 1.0, room)
 
 
-def test_bodies_under_way_share_one_room() -> None:
+def test_the_longest_body_makes_room_for_others() -> None:
     room = BodyRoom(150)
-    room.take(90)
-    with pytest.raises(OverloadError, match="120 bytes"):
-        asyncio.run(received(room, b"a" * 30, b"b" * 40))
-    assert room.held_bytes == 90
-    assert asyncio.run(received(room, b"a" * 30, b"b" * 20)) == b"a" * 30 + b"b" * 20
-    room.give(90)
+    with room.receiving() as long:
+        room.add(long, b"x" * 90)
+        assert asyncio.run(received(room, b"a" * 30, b"b" * 30)) == b"a" * 30 + b"b" * 30
+        assert room.held_bytes == 90
+        assert asyncio.run(received(room, b"a" * 60, b"b" * 20)) == b"a" * 60 + b"b" * 20
+        assert long.is_cut
+        assert room.held_bytes == 0
+        with pytest.raises(OverloadError, match="150 bytes"):
+            room.add(long, b"x")
     assert asyncio.run(received(room, b"a" * 60, b"b" * 40)) == b"a" * 60 + b"b" * 40
     assert room.held_bytes == 0
+
+
+def test_a_body_that_would_be_the_longest_is_the_one_that_goes() -> None:
+    room = BodyRoom(150)
+    with room.receiving() as first, room.receiving() as second:
+        room.add(first, b"x" * 70)
+        room.add(second, b"y" * 70)
+        with pytest.raises(OverloadError):
+            asyncio.run(received(room, b"a" * 90))
+        assert (first.is_cut, second.is_cut, room.held_bytes) == (False, False, 140)
+        room.add(first, b"x" * 10)
+        with pytest.raises(OverloadError):
+            room.add(first, b"x" * 10)
+        assert (first.is_cut, second.is_cut, room.held_bytes) == (True, False, 70)
 
 
 def test_a_body_that_is_too_long_gives_its_room_back() -> None:
