@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
+import onnxruntime as ort
+
 from service.logs import configure_logging
 from service.nets.pack import load_pack
 from service.nets.providers import is_gpu
@@ -31,7 +33,7 @@ def make_runner(settings: Settings, load: Load = load_pipeline) -> FrameSetRunne
 
     load: makes the pipeline; a function of a module, since worker processes look it up by its name.
     """
-    if settings.worker_kind == "thread" or (settings.worker_kind == "auto" and is_gpu(settings.provider)):
+    if settings.worker_kind == "thread" or (settings.worker_kind == "auto" and is_gpu(settings.provider, ort.get_available_providers())):
         return load(settings)
     return ProcessRunner(partial(_load_in_process, settings, load), settings.workers)
 

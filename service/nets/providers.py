@@ -11,8 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-import onnxruntime as ort
-
 from service.errors import InputError, PackError
 
 logger = logging.getLogger(__name__)
@@ -58,9 +56,9 @@ def choose(asked: Provider, offered: Sequence[str]) -> Choice:
     return Choice(asked, True)
 
 
-def is_gpu(asked: Provider) -> bool:
-    """Whether the networks would run on CUDA or TensorRT with this setting. Raises InputError as :func:`choose` does."""
-    return choose(asked, ort.get_available_providers()).provider in ("cuda", "tensorrt")
+def is_gpu(asked: Provider, offered: Sequence[str]) -> bool:
+    """Whether the networks would run on CUDA or TensorRT with this setting; takes and raises what :func:`choose` does."""
+    return choose(asked, offered).provider in ("cuda", "tensorrt")
 
 
 def session_providers(choice: Choice, offered: Sequence[str], intra_op_threads: int) -> list[tuple[str, dict[str, str]]]:

@@ -20,7 +20,7 @@ from service.worker_processes import ProcessRunner
     [("auto", False, ProcessRunner), ("auto", True, Pipeline), ("process", True, ProcessRunner), ("thread", False, Pipeline)],
 )
 def test_kinds_of_workers(monkeypatch: pytest.MonkeyPatch, kind: Any, gpu: bool, expected: type) -> None:
-    monkeypatch.setattr("service.runners.is_gpu", lambda provider: gpu)
+    monkeypatch.setattr("service.runners.is_gpu", lambda provider, offered: gpu)
     runner = make_runner(Settings(worker_kind=kind, workers=1, provider="cpu"))
     try:
         assert isinstance(runner, expected)
