@@ -33,7 +33,8 @@ def make_runner(settings: Settings, load: Load = load_pipeline) -> FrameSetRunne
 
     load: makes the pipeline; a function of a module, since worker processes look it up by its name.
     """
-    if settings.worker_kind == "thread" or (settings.worker_kind == "auto" and is_gpu(settings.provider, ort.get_available_providers())):
+    on_gpu = settings.worker_kind == "auto" and is_gpu(settings.provider, ort.get_available_providers())
+    if settings.worker_kind == "thread" or on_gpu:
         return load(settings)
     return ProcessRunner(partial(_load_in_process, settings, load), settings.workers)
 
