@@ -74,12 +74,20 @@ class BodyRoom:
                 longest = body
             longest.data = bytearray()
             longest.is_cut = True
+        self._require_kept(body)
+        body.data += chunk
+
+    def whole(self, body: _Body) -> bytes:
+        """A body that has come to its end. Raises OverloadError when it had to make room meanwhile."""
+        self._require_kept(body)
+        return bytes(body.data)
+
+    def _require_kept(self, body: _Body) -> None:
         if body.is_cut:
             raise OverloadError(
                 f"all bodies under way may take {self._max_bytes} bytes together, and this one was the longest.",
                 remedy="Send fewer bodies at a time, or raise QUADLIFT_MAX_BODIES_BYTES.",
             )
-        body.data += chunk
 
 
 async def read_body(request: Request, max_bytes: int, limit_s: float, room: BodyRoom) -> bytes:
@@ -104,7 +112,7 @@ async def read_body(request: Request, max_bytes: int, limit_s: float, room: Body
                 field="body",
                 remedy="Send faster, compress the frames more, or raise QUADLIFT_BODY_RECEIVE_S.",
             ) from None
-        return bytes(body.data)
+        return room.whole(body)
 
 
 def parse_json(body: bytes) -> Any:

@@ -47,6 +47,9 @@ def test_the_longest_body_makes_room_for_others() -> None:
         assert room.held_bytes == 0
         with pytest.raises(OverloadError, match="150 bytes"):
             room.add(long, b"x")
+        # Also when nothing more was to come: what is gone must not pass for an empty body.
+        with pytest.raises(OverloadError, match="150 bytes"):
+            room.whole(long)
     assert asyncio.run(received(room, b"a" * 60, b"b" * 40)) == b"a" * 60 + b"b" * 40
     assert room.held_bytes == 0
 
