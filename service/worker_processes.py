@@ -17,7 +17,7 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext, SpawnContext
 from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING, Any
@@ -51,6 +51,8 @@ def _make_context() -> ForkServerContext | SpawnContext:
 
 
 _CONTEXT = _make_context()
+_ENDS = threading.Lock()
+"""Held by who asks whether a process has ended, as starting another one does of all: its exit code can be read but once."""
 
 
 class WorkerDiedError(Exception):
@@ -256,7 +258,8 @@ class _Process:
     def __post_init__(self) -> None:
         self._connection, theirs = _CONTEXT.Pipe()
         self._process = _CONTEXT.Process(target=_work, args=(theirs, self.load), name="quadlift-worker")
-        self._process.start()
+        with _ENDS:
+            self._process.start()
         theirs.close()
 
     @property
@@ -299,16 +302,17 @@ class _Process:
         self._connection.close()
 
     def kill(self) -> None:
-        self._process.kill()
-
-    def join(self, timeout_s: float) -> None:
-        self._process.join(max(0.0, timeout_s))
-        if self._process.is_alive():
+        with _ENDS:
             self._process.kill()
 
+    def join(self, timeout_s: float) -> None:
+        if not wait([self._process.sentinel], max(0.0, timeout_s)):
+            self.kill()
+
     def exit_code(self) -> int | None:
-        self._process.join(_END_S)
-        return self._process.exitcode
+        wait([self._process.sentinel], _END_S)
+        with _ENDS:
+            return self._process.exitcode
 
 
 def _work(connection: Connection, load: Callable[[], FrameSetRunner]) -> None:

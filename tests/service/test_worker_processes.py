@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +111,22 @@ def test_a_process_that_dies_is_replaced_by_a_warm_one(start: Callable[..., Proc
     second, warm = runner.run(asking("pid"))  # type: ignore[misc]
     assert second != first
     assert warm == 1
+
+
+def test_an_exit_code_is_not_lost_to_who_starts_another_process(
+    start: Callable[..., ProcessRunner], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = forkserver.read_signed
+
+    def read_slowly(fd: int) -> int:
+        time.sleep(0.1)
+        code: int = read(fd)
+        return code
+
+    # Starting one asks of all whether they have ended, and the answer can be read but once.
+    monkeypatch.setattr(forkserver, "read_signed", read_slowly)
+    with pytest.raises(WorkerDiedError, match="-9"):
+        start().run(asking("die"))
 
 
 def test_what_hangs_is_given_up_and_so_is_what_waits_for_it(start: Callable[..., ProcessRunner]) -> None:
