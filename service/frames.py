@@ -5,10 +5,11 @@ A header is parsed here, without a codec, so that a frame's size is known before
 
 from __future__ import annotations
 
+import itertools
 import struct
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import cv2
@@ -71,6 +72,11 @@ class FrameSet:
     """Cameras whose frame is of an earlier moment and stands in for one that did not come in time."""
     refused: Mapping[str, RefusedFrame] = field(default_factory=dict)
     """What cameras without a frame in this set sent instead, by camera id."""
+
+    def split(self, count: int) -> list[FrameSet]:
+        """The set in ``count`` parts (no more than it has frames) of about as many frames each, in their order."""
+        ends = [len(self.frames) * number // count for number in range(count + 1)]
+        return [replace(self, frames=self.frames[start:end]) for start, end in itertools.pairwise(ends)]
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -30,6 +30,7 @@ from service.nets.multibin import Multibin, MultibinEstimates, cut_crops
 from service.nets.pack import Pack
 from service.paper_fusion import PaperFusionSettings, fuse_paper
 from service.residuals import BoxProblem
+from service.sightings import Sightings
 from service.site import Site
 
 DOUBT = 2.0
@@ -118,10 +119,16 @@ class Pipeline:
 
     def run(self, frame_set: FrameSet) -> SetResult:
         """All steps for one set. Raises the first FrameError when not one frame can be decoded."""
+        return self.fuse(frame_set.site, [self.see(frame_set)])
+
+    def see(self, frame_set: FrameSet) -> Sightings:
+        """The steps that each camera of a set takes by itself, whatever the others saw: all but fusion."""
         timing: dict[str, float] = {}
         started = time.perf_counter()
         with _timed(timing, "decode"):
             stills, failed = self.decode(frame_set)
+        if not stills:
+            return Sightings.of_none(failed)
         cameras = [still.camera for still in stills]
         with _timed(timing, "detect"):
             canvases = Canvases([still.small for still in stills])
@@ -141,21 +148,43 @@ class Pipeline:
                 lifted, index, hard = self._guided(self.guidance, stills, found, maps, frame_set.site, lifted, index)
             # Guided boxes were not solved from terms: a set that has any is combined by covariance.
             terms = None if hard else terms
-        with _timed(timing, "fuse"):
-            fused = self._fuse(lifted, terms, index, cameras, frame_set.site)
-            keep = self._reported(fused.boxes)
+        own = {frame.camera_id: frame.captured_at_ns for frame in frame_set.frames if frame.captured_at_ns is not None}
         timing["total"] = 1e3 * (time.perf_counter() - started)
+        return Sightings(
+            cameras=tuple(cameras),
+            captured_at_ns=tuple(own.get(camera.id, frame_set.captured_at_ns) for camera in cameras),
+            boxes=lifted,
+            terms=terms,
+            camera_index=index,
+            hard=hard,
+            detections=tuple(len(detections) for detections in found),
+            timing_ms=timing,
+            failed=failed,
+        )
+
+    def fuse(self, site: Site, seen: Sequence[Sightings]) -> SetResult:
+        """What a set's cameras saw, made one. Raises the first FrameError when not one frame could be decoded."""
+        started = time.perf_counter()
+        sightings = Sightings.together(seen)
+        if not sightings.cameras:
+            raise next(iter(sightings.failed.values()))
+        timing, cameras, index = sightings.timing_ms, sightings.cameras, sightings.camera_index
+        before = timing.pop("total")
+        with _timed(timing, "fuse"):
+            fused = self._fuse(sightings, site)
+            keep = self._reported(fused.boxes)
+        timing["total"] = before + 1e3 * (time.perf_counter() - started)
         return SetResult(
             boxes=fused.boxes.take(keep),
             members=fused.members[keep],
             camera_ids=tuple(camera.id for camera in cameras),
             classes=self.classes,
-            per_camera=[lifted.take(index == number) for number in range(len(cameras))],
-            detections={camera.id: int((index == number).sum()) for number, camera in enumerate(cameras)},
+            per_camera=[sightings.boxes.take(index == number) for number in range(len(cameras))],
+            detections={camera.id: count for camera, count in zip(cameras, sightings.detections, strict=True)},
             timing_ms=timing,
-            failed=failed,
-            parts=None if fused.parts is None else _timed_parts(fused.parts.of_rows(keep), frame_set, cameras),
-            hard=hard,
+            failed=sightings.failed,
+            parts=None if fused.parts is None else sightings.timed(fused.parts.of_rows(keep)),
+            hard=sightings.hard,
         )
 
     def _lift(self, cameras: list[Camera], site: Site, measurements: Measurements) -> tuple[Boxes, BoxProblem | None]:
@@ -185,19 +214,12 @@ class Pipeline:
         lifted, index = guidance.add(views, hard, site.ground, lifted, index, self.settings.method)
         return lifted, index, frozenset(still.camera.id for still, is_hard in zip(stills, hard, strict=True) if is_hard)
 
-    def _fuse(
-        self,
-        lifted: Boxes,
-        terms: BoxProblem | None,
-        camera_index: NDArray[np.int64],
-        cameras: list[Camera],
-        site: Site,
-    ) -> FusedBoxes:
+    def _fuse(self, seen: Sightings, site: Site) -> FusedBoxes:
         if self.settings.method == "paper":
-            return fuse_paper(lifted, camera_index, cameras, self.settings.paper_fusion)
+            return fuse_paper(seen.boxes, seen.camera_index, seen.cameras, self.settings.paper_fusion)
         told = site.accuracy
         settings = replace(self.settings.fusion, calibration_sigma_m=told.camera_m, calibration_sigma_rad=told.camera_rad)
-        return fuse(lifted, camera_index, cameras, settings, terms)
+        return fuse(seen.boxes, seen.camera_index, seen.cameras, settings, seen.terms)
 
     def _reported(self, boxes: Boxes) -> NDArray[np.bool_]:
         confident = boxes.score >= self.settings.min_fused_score
@@ -207,10 +229,7 @@ class Pipeline:
         return confident & (sigma <= self.settings.max_position_sigma_m)
 
     def decode(self, frame_set: FrameSet) -> tuple[list[Still], dict[str, FrameError]]:
-        """The first step alone: every frame at the sizes that the networks want, and the cameras whose frames are damaged.
-
-        Raises the first FrameError when not one frame can be decoded.
-        """
+        """The first step alone: every frame at the sizes that the networks want, and the cameras whose frames are damaged."""
         stills, failed = [], {}
         small_width = self.detector.spec.max_width
         crop_width = max(self.multibin.spec.max_width or 0, small_width)
@@ -223,8 +242,6 @@ class Pipeline:
                 failed[camera.id] = error
                 continue
             stills.append(Still(camera, reduced(image, crop_width), reduced(image, small_width), image))
-        if failed and not stills:
-            raise next(iter(failed.values()))
         return stills, failed
 
     def _detect(self, canvases: Canvases) -> list[Detections]:
@@ -252,13 +269,6 @@ class Pipeline:
             for (inverse, scale), detections in zip(maps, found, strict=True)
         ]
         return DepthReadings(np.concatenate([p.depth_m for p in parts]), np.concatenate([p.sigma_m for p in parts]))
-
-
-def _timed_parts(parts: CameraParts, frame_set: FrameSet, cameras: list[Camera]) -> CameraParts:
-    """The parts with their cameras' capture times; the set's time where a camera has none of its own."""
-    own = {frame.camera_id: frame.captured_at_ns for frame in frame_set.frames if frame.captured_at_ns is not None}
-    times = np.array([own.get(camera.id, frame_set.captured_at_ns) for camera in cameras], dtype=np.int64)
-    return replace(parts, captured_at_ns=times[parts.camera])
 
 
 @contextmanager

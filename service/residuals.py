@@ -6,6 +6,7 @@ undistorted normalised coordinates (x/z, y/z); distances there are pixels over t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -89,6 +90,13 @@ class BoxProblem:
     shift_sigma: Array | None = None
     """(N,) how far, normalised, the whole picture may be shifted along each axis, one sigma: all edges and tangents move
     together. None: not at all."""
+
+    @staticmethod
+    def concatenate(parts: Sequence[BoxProblem]) -> BoxProblem:
+        """The boxes of one or more problems on the same ground, in order, before any picture may be shifted."""
+        return BoxProblem(
+            **{name: np.concatenate([getattr(part, name) for part in parts]) for name in _PER_BOX}, ground=parts[0].ground
+        )
 
     def take(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> BoxProblem:
         """The boxes at an index or mask."""

@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from service.errors import FrameError, PackError
 from service.frames import FrameSet
+from service.sightings import Sightings
 from service.site import Site
 
 
@@ -50,6 +53,24 @@ class Scripted:
                 Path(path.decode()).touch()
                 time.sleep(0.5)
         return "done"
+
+
+class Divisible(Scripted):
+    """Also does it with parts of sets; what it saw tells who saw it, and its result is who saw each frame."""
+
+    def see(self, frame_set: FrameSet) -> Sightings:
+        for frame in frame_set.frames:
+            self.run(replace(frame_set, frames=(frame,)))
+        cameras = tuple(frame_set.site.camera(frame.camera_id) for frame in frame_set.frames)
+        seen = Sightings.of_none({})
+        pids = (os.getpid(),) * len(cameras)
+        times = {"see": 1.0, "total": 1.0}
+        return replace(seen, cameras=cameras, captured_at_ns=pids, timing_ms=times)
+
+    def fuse(self, site: Site, seen: Sequence[Sightings]) -> Any:
+        whole = Sightings.together(seen)
+        assert [camera.id for camera in whole.cameras] == [camera.id for camera in site.cameras]
+        return whole.captured_at_ns, whole.timing_ms["see"]
 
 
 def refuse() -> Scripted:

@@ -14,8 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.errors import FrameError, TooLargeError
-from service.frames import FrameLimits, check_frame, decode, decoded_size, read_header, reduced
+from service.frames import EncodedFrame, FrameLimits, FrameSet, check_frame, decode, decoded_size, read_header, reduced
 from service.geometry.camera import Camera
+from service.site import Site
 
 LIMITS = FrameLimits()
 
@@ -171,3 +172,13 @@ def test_halving_is_a_mean_of_four() -> None:
     image = np.arange(2 * 4 * 3, dtype=np.uint8).reshape(2, 4, 3)
     expected = image.reshape(1, 2, 2, 2, 3).mean((1, 3))
     np.testing.assert_allclose(reduced(image, 2), expected, atol=0.5)
+
+
+@given(frames=st.integers(1, 20), count=st.integers(1, 20))
+def test_a_set_is_split_into_parts_of_about_as_many_frames(frames: int, count: int) -> None:
+    whole = FrameSet(Site("demo"), tuple(EncodedFrame(f"c{n}", b"", None) for n in range(frames)), 5, 7)
+    parts = whole.split(min(count, frames))
+    assert tuple(frame for part in parts for frame in part.frames) == whole.frames
+    sizes = [len(part.frames) for part in parts]
+    assert 1 <= min(sizes) <= max(sizes) <= min(sizes) + 1
+    assert {(part.site.id, part.captured_at_ns, part.sequence) for part in parts} == {("demo", 5, 7)}

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import pickle
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import simplejpeg
 from numpy.typing import NDArray
 
 from service.errors import FrameError
@@ -16,6 +18,7 @@ from service.frames import EncodedFrame, FrameSet
 from service.nets.multibin import MultibinEstimates
 from service.nets.pack import load_pack
 from service.pipeline import Pipeline, PipelineSettings, SetResult
+from service.sightings import Sightings
 from service.site import AccuracyModel, parse_site
 
 CLIP = Path(__file__).resolve().parents[2] / "clients" / "clip"
@@ -117,6 +120,46 @@ def test_cameras_in_another_order_give_the_same_vehicles(pipeline: Pipeline) -> 
     assert len(forward) == len(backward)
     distance = np.linalg.norm(forward[:, None] - backward[None], axis=-1)
     assert distance.min(1).max() < 0.3
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_a_set_in_parts_gives_the_same_answer(pipeline: Pipeline, count: int) -> None:
+    # A site of its own each: fitted scales of the depth map are kept a camera.
+    whole, parts = pipeline.run(frame_set(40)), frame_set(40).split(count)
+    again = pipeline.fuse(parts[0].site, [pickle.loads(pickle.dumps(pipeline.see(part))) for part in parts])
+    assert again.camera_ids == whole.camera_ids
+    assert again.detections == whole.detections
+    assert (again.members == whole.members).all()
+    assert again.boxes.center == pytest.approx(whole.boxes.center, abs=1e-6)
+    assert again.boxes.covariance == pytest.approx(whole.boxes.covariance, abs=1e-6)
+    assert again.parts is not None
+    assert whole.parts is not None
+    assert (again.parts.captured_at_ns == whole.parts.captured_at_ns).all()
+
+
+def test_a_part_whose_frames_are_damaged_leaves_the_others(pipeline: Pipeline) -> None:
+    whole = frame_set(40)
+    torn = [replace(frame, data=frame.data[:2000]) for frame in whole.frames[:2]]
+    parts = replace(whole, frames=(*torn, *whole.frames[2:])).split(2)
+    result = pipeline.fuse(whole.site, [pipeline.see(part) for part in parts])
+    assert_well_formed(result)
+    assert set(result.failed) == {frame.camera_id for frame in torn}
+    assert result.camera_ids == tuple(frame.camera_id for frame in whole.frames[2:])
+    with pytest.raises(FrameError) as caught:
+        pipeline.fuse(whole.site, [pipeline.see(part) for part in replace(whole, frames=(*torn,)).split(2)])
+    assert caught.value.field == torn[0].camera_id
+
+
+def test_a_part_with_nothing_in_it_takes_nothing_away(pipeline: Pipeline) -> None:
+    whole = frame_set(40)
+    blank = simplejpeg.encode_jpeg(np.full((whole.site.cameras[0].height, whole.site.cameras[0].width, 3), 114, np.uint8))
+    first, second = replace(whole, frames=(replace(whole.frames[0], data=blank), *whole.frames[1:])).split(2)
+    seen = [pipeline.see(replace(first, frames=first.frames[:1])), pipeline.see(second)]
+    assert seen[0].terms is None
+    together = Sightings.together(seen)
+    assert together.terms is not None
+    assert len(together.boxes) == len(seen[1].boxes)
+    assert (together.camera_index == seen[1].camera_index + 1).all()
 
 
 def test_the_papers_method_runs_the_whole_way(pipeline: Pipeline) -> None:

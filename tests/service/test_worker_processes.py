@@ -38,8 +38,8 @@ def scripted(monkeypatch: pytest.MonkeyPatch) -> Any:
 def start(scripted: Any) -> Iterator[Callable[..., ProcessRunner]]:
     runners: list[ProcessRunner] = []
 
-    def build(size: int = 1) -> ProcessRunner:
-        runners.append(ProcessRunner(scripted.Scripted, size))
+    def build(size: int = 1, kind: str = "Scripted") -> ProcessRunner:
+        runners.append(ProcessRunner(getattr(scripted, kind), size))
         return runners[-1]
 
     yield build
@@ -59,7 +59,7 @@ def asking(words: str, at: Site = HERE) -> FrameSet:
     return FrameSet(at, (EncodedFrame("north", words.encode(), None),), 0, 1)
 
 
-def until(condition: Callable[[], bool], seconds: float = 20.0) -> None:
+def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "waited too long"
@@ -141,7 +141,7 @@ def test_what_hangs_is_given_up_and_so_is_what_waits_for_it(start: Callable[...,
     hanging, waiting = asking("hang"), asking("hang")
     threads = [threading.Thread(target=run, args=(each,)) for each in (hanging, waiting)]
     threads[0].start()
-    until(lambda: runner._running.get(hanging) is not None)
+    until(lambda: runner._running.get(hanging))
     threads[1].start()
     until(lambda: waiting in runner._running)
     runner.give_up(waiting)
@@ -152,6 +152,94 @@ def test_what_hangs_is_given_up_and_so_is_what_waits_for_it(start: Callable[...,
     assert "in time" in ends[0]
     # Of a set that is over nothing is left to give up.
     runner.give_up(hanging)
+    assert runner.run(asking("")) == "done"
+
+
+def asking_four(*words: str) -> FrameSet:
+    """A frame set of four cameras, which ask for so much in turn; the same for all where one is given."""
+    K = np.array([[800.0, 0, 320], [0, 800, 180], [0, 0, 1]])
+    cameras = tuple(Camera(name, 640, 360, K, np.zeros(0), np.eye(4)) for name in ("n", "e", "s", "w"))
+    each = words if len(words) == 4 else words * 4
+    frames = tuple(EncodedFrame(camera.id, word.encode(), None) for camera, word in zip(cameras, each, strict=True))
+    return FrameSet(Site("demo", cameras, GroundPlane()), frames, 0, 1)
+
+
+def test_a_set_is_divided_between_idle_processes(start: Callable[..., ProcessRunner]) -> None:
+    runner = start(3, "Divisible")
+    pids, took_ms = runner.run(asking_four(""))  # type: ignore[misc]
+    assert len(set(pids)) == 3
+    # Side by side: they took as long as one of them.
+    assert took_ms == 1.0
+    one, _ = start(1, "Divisible").run(asking_four(""))  # type: ignore[misc]
+    assert len(set(one)) == 1
+
+
+def test_who_becomes_idle_joins_a_set_that_is_being_run(start: Callable[..., ProcessRunner], tmp_path: Path) -> None:
+    runner, begun = start(2, "Divisible"), tmp_path / "begun"
+    runner._division.took(8.0, divided=False)
+    runner._division._interval_s = 30.0
+    busy = threading.Thread(target=lambda: runner.run(asking(f"wait {begun}")))
+    busy.start()
+    until(begun.exists)
+    (pids, took_ms) = runner.run(asking_four(f"wait {tmp_path / 'second'}"))  # type: ignore[misc]
+    assert len(set(pids)) == 2
+    assert took_ms == 1.0
+    busy.join()
+
+
+def test_who_is_joined_by_nobody_does_the_rest_itself(start: Callable[..., ProcessRunner]) -> None:
+    pids, took_ms = start(1, "Divisible").run(asking_four(""))  # type: ignore[misc]
+    assert len(pids) == 4
+    assert len(set(pids)) == 1
+    # One part after the other.
+    assert took_ms == 2.0
+
+
+@pytest.mark.parametrize("where", range(4))
+def test_an_error_in_a_part_is_the_sets_and_all_go_on(start: Callable[..., ProcessRunner], where: int) -> None:
+    runner = start(2, "Divisible")
+    words = [""] * 4
+    words[where] = "frame-error"
+    with pytest.raises(FrameError, match="not a JPEG"):
+        runner.run(asking_four(*words))
+    pids, _ = runner.run(asking_four(""))  # type: ignore[misc]
+    assert len(set(pids)) == 2
+
+
+@pytest.mark.parametrize("where", range(4))
+def test_a_process_that_dies_of_a_part_is_replaced(start: Callable[..., ProcessRunner], where: int) -> None:
+    runner = start(2, "Divisible")
+    before, _ = runner.run(asking_four(""))  # type: ignore[misc]
+    words = [""] * 4
+    words[where] = "die"
+    with pytest.raises(WorkerDiedError, match="-9"):
+        runner.run(asking_four(*words))
+    until(lambda: len(runner._idle) == 2)
+    after, _ = runner.run(asking_four(""))  # type: ignore[misc]
+    assert len(set(before) & set(after)) == 1
+    assert len(set(after)) == 2
+
+
+@pytest.mark.parametrize("where", [0, 3])
+def test_a_divided_set_that_hangs_is_given_up(start: Callable[..., ProcessRunner], where: int) -> None:
+    runner = start(2, "Divisible")
+    words = [""] * 4
+    words[where] = "hang"
+    hanging, ends = asking_four(*words), list[WorkerDiedError]()
+
+    def run() -> None:
+        with pytest.raises(WorkerDiedError) as caught:
+            runner.run(hanging)
+        ends.append(caught.value)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    until(lambda: len(runner._running.get(hanging, ())) > 0)
+    time.sleep(0.2)
+    runner.give_up(hanging)
+    thread.join(10)
+    assert ends
+    until(lambda: len(runner._idle) == 2)
     assert runner.run(asking("")) == "done"
 
 
