@@ -107,9 +107,12 @@ def read_boxes(inverse: InverseDepth, scale: DepthScale | None, xyxy_px: Array, 
     # A grid of points over the middle half, the same number for every box, so that all medians are one operation.
     x = xyxy_px[:, None, 0] + (xyxy_px[:, None, 2] - xyxy_px[:, None, 0]) * _MIDDLE_HALF
     y = xyxy_px[:, None, 1] + (xyxy_px[:, None, 3] - xyxy_px[:, None, 1]) * _MIDDLE_HALF
-    column = np.clip(np.floor((x + 0.5) / inverse.stride).astype(np.int64), 0, columns - 1)
-    row = np.clip(np.floor((y + 0.5) / inverse.stride).astype(np.int64), 0, rows - 1)
-    middle = np.median(inverse.values[row[:, :, None], column[:, None, :]].reshape(len(xyxy_px), -1), axis=1)
+    column = np.minimum(np.maximum(np.floor((x + 0.5) / inverse.stride).astype(np.int64), 0), columns - 1)
+    row = np.minimum(np.maximum(np.floor((y + 0.5) / inverse.stride).astype(np.int64), 0), rows - 1)
+    values = inverse.values[row[:, :, None], column[:, None, :]].reshape(len(xyxy_px), -1)
+    # Their number is odd: the median is one of them. NaN sorts last, so a few do not spoil it.
+    half = values.shape[1] // 2
+    middle = np.partition(values, half, axis=1)[:, half]
     inverse_m = scale.scale * middle + scale.shift
     usable = inverse_m > 1.0 / FARTHEST_M
     depth = np.where(usable, 1.0 / np.where(usable, inverse_m, 1.0), np.nan) / (1.0 + error.bias)

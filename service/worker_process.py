@@ -6,6 +6,7 @@ answers one message at a time, in order. A site is sent once, not with every fra
 
 from __future__ import annotations
 
+import gc
 import io
 import multiprocessing
 import pickle
@@ -279,6 +280,8 @@ def _work(connection: Connection, load: Callable[[], FrameSetRunner]) -> None:
             answer = _failed(error)
         else:
             desk, answer = _Desk(runner, sites), _Answer(isinstance(runner, DivisibleRunner))
+            # What is loaded by now stays: the collector need not look through it again and again.
+            gc.freeze()
         connection.send_bytes(pickle.dumps(answer, pickle.HIGHEST_PROTOCOL))
         while desk is not None:
             message = _SiteUnpickler(connection.recv_bytes(), sites).load()

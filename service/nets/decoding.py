@@ -61,12 +61,11 @@ def _quadlift(heads: Outputs, spec: DetectorSpec, threshold: float) -> _Candidat
     sigmoid(class): YOLOv3's decoding, with its exponential replaced by a bounded square so that no logit overflows, and
     centres free to reach into the next cell.
     """
-    parts = []
-    for cells in _anchored_cells(heads, spec, threshold):
-        center = (2.0 * _sigmoid(cells.logits[:, :2]) - 0.5 + cells.cell) * cells.stride
-        size = (2.0 * _sigmoid(cells.logits[:, 2:4])) ** 2 * cells.anchor
-        parts.append(_scored(center, size, _sigmoid(cells.logits[:, 4:])))
-    return _joined(parts)
+    cells = _anchored_cells(heads, spec, threshold)
+    fields = _sigmoid(cells.logits)
+    center = (2.0 * fields[:, :2] - 0.5 + cells.cell) * cells.stride
+    size = (2.0 * fields[:, 2:4]) ** 2 * cells.anchor
+    return _scored(center, size, fields[:, 4:])
 
 
 def _yolov3(heads: Outputs, spec: DetectorSpec, threshold: float) -> _Candidates:
@@ -74,12 +73,10 @@ def _yolov3(heads: Outputs, spec: DetectorSpec, threshold: float) -> _Candidates
 
     Per anchor: centre = (sigmoid(t) + cell) * stride, size = anchor * exp(t), score = sigmoid(objectness) * sigmoid(class).
     """
-    parts = []
-    for cells in _anchored_cells(heads, spec, threshold):
-        center = (_sigmoid(cells.logits[:, :2]) + cells.cell) * cells.stride
-        size = cells.anchor * np.exp(np.minimum(cells.logits[:, 2:4], MAX_LOG_SIZE))
-        parts.append(_scored(center, size, _sigmoid(cells.logits[:, 4:])))
-    return _joined(parts)
+    cells = _anchored_cells(heads, spec, threshold)
+    center = (_sigmoid(cells.logits[:, :2]) + cells.cell) * cells.stride
+    size = cells.anchor * np.exp(np.minimum(cells.logits[:, 2:4], MAX_LOG_SIZE))
+    return _scored(center, size, _sigmoid(cells.logits[:, 4:]))
 
 
 def _yolox(heads: Outputs, spec: DetectorSpec, threshold: float) -> _Candidates:
@@ -166,7 +163,7 @@ _DECODERS = {
 
 @dataclass(frozen=True, eq=False)
 class _AnchoredCells:
-    """Candidates of one stride of a format with anchors."""
+    """Candidates of all strides of a format with anchors."""
 
     logits: Array
     """(n, 5 + C)"""
@@ -174,19 +171,32 @@ class _AnchoredCells:
     """(n, 2) column and row."""
     anchor: Array
     """(n, 2) width and height, px."""
-    stride: int
+    stride: Array
+    """(n, 1) px."""
 
 
-def _anchored_cells(heads: Outputs, spec: DetectorSpec, threshold: float) -> list[_AnchoredCells]:
+def _anchored_cells(heads: Outputs, spec: DetectorSpec, threshold: float) -> _AnchoredCells:
     """Cells whose objectness passes; a score is at most its objectness."""
-    found = []
-    for head, stride, anchors in zip(heads, spec.strides, spec.anchors_px, strict=True):
+    logits, cells, counts = [], [], []
+    least = _logit(threshold)
+    for head, anchors in zip(heads, spec.anchors_px, strict=True):
         grid = head.reshape(len(anchors), BOX_FIELDS + spec.network_classes, *head.shape[-2:])
-        anchor, row, column = np.nonzero(grid[:, 4] > _logit(threshold))
-        logits = grid[anchor, :, row, column].astype(np.float64)
-        sizes = np.asarray(anchors, dtype=np.float64)[anchor]
-        found.append(_AnchoredCells(logits, np.stack([column, row], -1).astype(np.float64), sizes, stride))
-    return found
+        passes = grid[:, 4] > least
+        # Three times as quick as `nonzero` of three axes.
+        anchor, row, column = np.unravel_index(np.flatnonzero(passes), passes.shape)
+        logits.append(grid[anchor, :, row, column])
+        cells.append(np.array([column, row, anchor]))
+        counts.append(len(anchor))
+    column, row, anchor = np.concatenate(cells, 1)
+    level = np.repeat(np.arange(len(heads)), counts)
+    sizes = np.array([size for anchors in spec.anchors_px for size in anchors], dtype=np.float64)
+    first = np.cumsum([0, *(len(anchors) for anchors in spec.anchors_px)])
+    return _AnchoredCells(
+        np.concatenate(logits).astype(np.float64),
+        np.stack([column, row], 1).astype(np.float64),
+        sizes[first[level] + anchor],
+        np.array(spec.strides, dtype=np.float64)[level, None],
+    )
 
 
 def _flat_cells(spec: DetectorSpec) -> tuple[Array, Array]:
@@ -226,20 +236,12 @@ def _class_ids(values: NDArray[np.generic], spec: DetectorSpec) -> NDArray[np.in
     return np.where(possible, ids, spec.network_classes).astype(np.int64)
 
 
-def _joined(parts: Sequence[_Candidates]) -> _Candidates:
-    return _Candidates(
-        np.concatenate([part.xyxy for part in parts]),
-        np.concatenate([part.score for part in parts]),
-        np.concatenate([part.network_cls for part in parts]),
-    )
-
-
 def _box(center: Array, size: Array) -> Array:
     return np.concatenate([center - 0.5 * size, center + 0.5 * size], 1)
 
 
 def _sigmoid(logits: Array) -> Array:
-    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(logits, -500.0, 500.0))))
+    return np.asarray(1.0 / (1.0 + np.exp(-np.minimum(np.maximum(logits, -500.0), 500.0))))
 
 
 def _logit(probability: float) -> float:

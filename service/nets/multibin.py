@@ -252,13 +252,29 @@ def crop_vehicles(image: NDArray[np.uint8], xyxy_px: ArrayLike, crop_px: int) ->
     crops = np.empty((len(xyxy), crop_px, crop_px, 3), np.uint8)
     height, width = image.shape[:2]
     for row, (left, top, side) in enumerate(crop_windows(xyxy).tolist()):
-        inside = image[max(top, 0) : max(min(top + side, height), 0), max(left, 0) : max(min(left + side, width), 0)]
-        if inside.shape[:2] != (side, side):
-            square = np.full((side, side, 3), PAD_VALUE, np.uint8)
-            y, x = max(-top, 0), max(-left, 0)
-            square[y : y + inside.shape[0], x : x + inside.shape[1]] = inside
-            inside = square
-        # Averaging over areas costs up to ten times as much and shows in no figure until crops shrink by more than this.
-        interpolation = cv2.INTER_AREA if side > _MAX_SHRINK * crop_px else cv2.INTER_LINEAR
-        cv2.resize(inside, (crop_px, crop_px), dst=crops[row], interpolation=interpolation)
+        right, bottom = left + side, top + side
+        window = image[max(top, 0) : max(min(bottom, height), 0), max(left, 0) : max(min(right, width), 0)]
+        if window.shape[:2] != (side, side):
+            window = _padded(window, side, max(-left, 0), max(-top, 0))
+        crops[row] = _shrunk(window, crop_px)
     return crops
+
+
+def _padded(inside: NDArray[np.uint8], side: int, x: int, y: int) -> NDArray[np.uint8]:
+    """A square window of which ``inside`` is what lies in the image, from column x and row y on."""
+    if not inside.size:
+        return np.full((side, side, 3), PAD_VALUE, np.uint8)
+    height, width = inside.shape[:2]
+    edges = (y, side - y - height, x, side - x - width)
+    square = cv2.copyMakeBorder(inside, *edges, cv2.BORDER_CONSTANT | cv2.BORDER_ISOLATED, value=(PAD_VALUE,) * 3)
+    return np.asarray(square, dtype=np.uint8)
+
+
+def _shrunk(window: NDArray[np.uint8], crop_px: int) -> NDArray[np.uint8]:
+    """A square window (side, side, 3) at the size of a crop."""
+    # Averaging over areas costs up to ten times as much and shows in no figure until crops shrink by more than this; but
+    # over 2x2 pixels it is cheap. An odd row or column that this leaves out is less than a pixel of the crop.
+    while (side := window.shape[0]) > _MAX_SHRINK * crop_px:
+        half = side // 2
+        window = cv2.resize(window[: 2 * half, : 2 * half], (half, half), interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+    return np.asarray(cv2.resize(window, (crop_px, crop_px), interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
