@@ -14,7 +14,7 @@ import signal
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
@@ -99,21 +99,21 @@ class _Run:
 
 @dataclass(frozen=True)
 class _See:
-    """Asks a process what a part of a set shows."""
+    """Asks a process what a part of a set shows. It answers with that, packed, and keeps it for :class:`_Fuse`."""
 
     part: FrameSet
-    keeps: bool
-    """It is to keep what it saw for :class:`_Fuse`; else that is its answer, packed."""
     request_id: str | None
 
 
 @dataclass(frozen=True)
 class _Fuse:
-    """Asks the process that kept a part of a set for the result of the whole set."""
+    """Asks the process that saw a part of a set last for the result of the whole set."""
 
     site: Site
-    others: list[bytes]
-    """What others saw, packed."""
+    before: list[bytes]
+    """What others saw of the parts before its own, packed."""
+    after: list[bytes]
+    """And of those after it."""
     rest: FrameSet | None
     """A part of the set that nobody else took."""
     request_id: str | None
@@ -172,12 +172,13 @@ class WorkerProcess:
     took_s: float = field(default=0.0, init=False)
     """What its last answer took it."""
     _process: BaseProcess = field(init=False)
-    _connection: Connection = field(init=False)
+    connection: Connection = field(init=False)
+    """To it."""
     _sites: dict[str, Site] = field(default_factory=dict, init=False)
     """What it knows."""
 
     def __post_init__(self) -> None:
-        self._connection, theirs = _CONTEXT.Pipe()
+        self.connection, theirs = _CONTEXT.Pipe()
         self._process = _CONTEXT.Process(target=_work, args=(theirs, self.load), name="quadlift-worker")
         with _ENDS:
             self._process.start()
@@ -205,14 +206,17 @@ class WorkerProcess:
         result: SetResult = self.await_answer()
         return result
 
-    def begin(self, part: FrameSet, *, keeps: bool) -> None:
-        """Let it look at a part of a set; :meth:`await_answer` has what it saw, packed, unless it keeps that."""
+    def begin(self, part: FrameSet) -> None:
+        """Let it look at a part of a set; its answer is what it saw, packed."""
         self._teach(part.site)
-        self._send(_See(part, keeps, request_id.get()), part.site)
+        self._send(_See(part, request_id.get()), part.site)
 
-    def fuse(self, site: Site, others: list[bytes], rest: FrameSet | None = None) -> SetResult:
-        """The result of the set whose part it kept, whose other parts others saw, and whose ``rest`` nobody did yet."""
-        self._send(_Fuse(site, others, rest, request_id.get()), site)
+    def fuse(self, site: Site, before: list[bytes], after: list[bytes], rest: FrameSet | None = None) -> SetResult:
+        """The result of the set of which it has just seen a part.
+
+        before, after: what others saw of the parts before and after its own. rest: the part after its own, if nobody saw it.
+        """
+        self._send(_Fuse(site, before, after, rest, request_id.get()), site)
         result: SetResult = self.await_answer()
         return result
 
@@ -223,7 +227,7 @@ class WorkerProcess:
     def await_answer(self) -> Any:
         """What it has to say; raises its error, and EndedError when it has ended."""
         try:
-            said = self._connection.recv_bytes()
+            said = self.connection.recv_bytes()
         except (EOFError, OSError):
             raise EndedError from None
         answer: _Answer = pickle.loads(said)
@@ -235,7 +239,7 @@ class WorkerProcess:
 
     def end(self) -> None:
         """Let it end by itself."""
-        self._connection.close()
+        self.connection.close()
 
     def kill(self) -> None:
         """End it, whatever it does."""
@@ -263,7 +267,15 @@ class WorkerProcess:
     def _send(self, message: _Learn | _WarmUp | _Run | _See | _Fuse, site: Site | None) -> None:
         # That it has ended shows when its answer is awaited.
         with suppress(OSError):
-            self._connection.send_bytes(_packed(message, site))
+            self.connection.send_bytes(_packed(message, site))
+
+
+def as_answered(processes: Sequence[WorkerProcess]) -> Iterator[WorkerProcess]:
+    """Processes that were asked something, each as soon as its answer is there or it has ended."""
+    waiting = {process.connection: process for process in processes}
+    while waiting:
+        for connection in wait(list(waiting)):
+            yield waiting.pop(connection)  # type: ignore[call-overload]
 
 
 def _work(connection: Connection, load: Callable[[], FrameSetRunner]) -> None:
@@ -302,7 +314,7 @@ class _Desk:
     """A FrameSetRunner; of parts of sets only a DivisibleRunner is asked."""
     sites: dict[str, Site]
     kept: Sightings | None = None
-    """Of the part of a set that is to be fused here."""
+    """Of the part of a set that was seen last."""
 
     def answer(self, message: _WarmUp | _Run | _See | _Fuse) -> _Answer:
         try:
@@ -322,17 +334,15 @@ class _Desk:
             return result
         if isinstance(message, _Fuse):
             own, self.kept = self.kept, None
-            assert own is not None, "a part is kept before a set is fused"
+            assert own is not None, "a part is seen before its set is fused"
             if message.rest is not None:
                 own = Sightings.together([own, self.runner.see(message.rest)], side_by_side=False)
-            whole: SetResult = self.runner.fuse(message.site, [own, *map(self._unpacked, message.others)])
+            before, after = ([self._unpacked(seen) for seen in parts] for parts in (message.before, message.after))
+            whole: SetResult = self.runner.fuse(message.site, [*before, own, *after])
             return whole
         self.kept = None
-        seen: Sightings = self.runner.see(message.part)
-        if not message.keeps:
-            return _packed(seen, message.part.site)
-        self.kept = seen
-        return None
+        self.kept = seen = self.runner.see(message.part)
+        return _packed(seen, message.part.site)
 
     def _unpacked(self, seen: bytes) -> Sightings:
         sightings: Sightings = _SiteUnpickler(seen, self.sites).load()

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from service.division import Division
 from service.frames import FrameSet
-from service.worker_process import EndedError, WorkerProcess
+from service.worker_process import EndedError, WorkerProcess, as_answered
 
 if TYPE_CHECKING:
     from service.pipeline import SetResult
@@ -78,12 +78,12 @@ class ProcessRunner:
         self._division.arrived()
         process = self._take(frame_set)
         try:
+            if self._is_worth_dividing(frame_set, process):
+                return self._run_divided(frame_set, process)
             with self._lent(process, frame_set):
-                if self._is_worth_dividing(frame_set, process):
-                    return self._run_divided(frame_set, process)
                 result = process.run(frame_set)
-                self._division.took(process.took_s, divided=False)
-                return result
+            self._division.took(process.took_s, divided=False)
+            return result
         finally:
             with self._changed:
                 self._running.pop(frame_set, None)
@@ -97,32 +97,33 @@ class ProcessRunner:
         return not others_wait and self._division.pays()
 
     def _run_divided(self, frame_set: FrameSet, first: WorkerProcess) -> SetResult:
-        """With all processes that are idle, or with the next to be; where there is none the first has done all by itself.
+        """With all processes that are idle, or with the next to be; where there is none the first does all by itself.
 
-        It keeps what it sees of its part and makes one of what all saw.
+        Who is done with its part is free for other sets at once; the last makes one of what all saw.
         """
         others = self._joined(frame_set, most=len(frame_set.frames) - 1, wait_s=0.0)
         own, *parts = frame_set.split(1 + max(1, len(others)))
-        first.begin(own, keeps=True)
+        first.begin(own)
         others = others or self._joined(frame_set, most=1, wait_s=self._division.part_s)
         for process, part in zip(others, parts, strict=bool(others)):
-            process.begin(part, keeps=False)
-        seen, errors, took_s = [], list[Exception](), 0.0
-        for process in others:
-            # Whoever is done is free for other sets at once.
+            process.begin(part)
+        rest = None if others else parts[0]
+        processes, took_s, errors = [first, *others], 0.0, list[Exception]()
+        seen = [b""] * len(processes)
+        for done, process in enumerate(as_answered(processes), start=1):
+            number = processes.index(process)
             try:
                 with self._lent(process, frame_set):
-                    seen.append(process.await_answer())
+                    seen[number] = process.await_answer()
                     took_s += process.took_s
+                    if done == len(processes) and not errors:
+                        result = process.fuse(frame_set.site, seen[:number], seen[number + 1 :], rest)
+                        self._division.took(took_s + process.took_s, divided=True)
+                        return result
             except Exception as error:
+                # All others have to come to an end, too.
                 errors.append(error)
-        first.await_answer()
-        if errors:
-            raise errors[0]
-        took_s += first.took_s
-        result = first.fuse(frame_set.site, seen, None if others else parts[0])
-        self._division.took(took_s + first.took_s, divided=True)
-        return result
+        raise errors[0]
 
     @contextmanager
     def _lent(self, process: WorkerProcess, frame_set: FrameSet) -> Iterator[None]:
