@@ -9,13 +9,16 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 
 from service.frames import FrameSet
-from service.pipeline import SetResult
+from service.pipeline import Pipeline, SetResult
 from service.scheduler import FrameSetRunner
 from service.settings import Settings
+from service.sightings import Sightings
+from service.site import Site
 
 FOLDER_VARIABLE = "BENCH_FAULTS"
 PROGRAM = "from benchmarks.load.faulty_service import main; main()"
@@ -33,26 +36,38 @@ class NetworkFault(StrEnum):
 
 
 class FaultyRunner:
-    """A pipeline's run with faults before it. Thread-safe: each file strikes once."""
+    """A pipeline's work with faults before it, on whole sets or parts of them. Thread-safe: each file strikes once."""
 
-    def __init__(self, runner: FrameSetRunner, folder: Path) -> None:
-        self._runner = runner
+    def __init__(self, pipeline: Pipeline, folder: Path) -> None:
+        self._pipeline = pipeline
         self._folder = folder
 
     def run(self, frame_set: FrameSet) -> SetResult:
         """The result of a frame set, unless a fault strikes it."""
-        fault = self._claim(frame_set.site.id)
+        self._strike(frame_set.site.id)
+        return self._pipeline.run(frame_set)
+
+    def see(self, frame_set: FrameSet) -> Sightings:
+        """What a part of a frame set shows, unless a fault strikes it."""
+        self._strike(frame_set.site.id)
+        return self._pipeline.see(frame_set)
+
+    def fuse(self, site: Site, seen: Sequence[Sightings]) -> SetResult:
+        """As the pipeline's own."""
+        return self._pipeline.fuse(site, seen)
+
+    def warm_up(self) -> None:
+        """As the pipeline's own."""
+        self._pipeline.warm_up()
+
+    def _strike(self, site_id: str) -> None:
+        fault = self._claim(site_id)
         if fault is NetworkFault.RAISE:
             raise RuntimeError("an injected fault of the networks")
         if fault is NetworkFault.HANG:
             time.sleep(HANG_S)
         if fault is NetworkFault.KILL:
             os.kill(os.getpid(), signal.SIGKILL)
-        return self._runner.run(frame_set)
-
-    def warm_up(self) -> None:
-        """As the pipeline's own."""
-        self._runner.warm_up()
 
     def _claim(self, site_id: str) -> NetworkFault | None:
         for fault in NetworkFault:
