@@ -45,6 +45,7 @@ class ProcessRunner:
         A pipeline that is a :class:`DivisibleRunner` shares sets with idle ones.
         """
         self._load = load
+        self._size = size
         self._changed = threading.Condition()
         self._idle: list[WorkerProcess] = []
         self._running: dict[FrameSet, list[WorkerProcess]] = {}
@@ -90,7 +91,7 @@ class ProcessRunner:
                 self._given_up.discard(frame_set)
 
     def _is_worth_dividing(self, frame_set: FrameSet, process: WorkerProcess) -> bool:
-        if len(frame_set.frames) < 2 or not process.is_divisible:
+        if self._size < 2 or len(frame_set.frames) < 2 or not process.is_divisible:
             return False
         with self._changed:
             others_wait = any(not processes for processes in self._running.values())

@@ -170,8 +170,6 @@ def test_a_set_is_divided_between_idle_processes(start: Callable[..., ProcessRun
     assert len(set(pids)) == 3
     # Side by side: they took as long as one of them.
     assert took_ms == 1.0
-    one, _ = start(1, "Divisible").run(asking_four(""))  # type: ignore[misc]
-    assert len(set(one)) == 1
 
 
 def test_who_becomes_idle_joins_a_set_that_is_being_run(start: Callable[..., ProcessRunner], tmp_path: Path) -> None:
@@ -187,12 +185,23 @@ def test_who_becomes_idle_joins_a_set_that_is_being_run(start: Callable[..., Pro
     busy.join()
 
 
-def test_who_is_joined_by_nobody_does_the_rest_itself(start: Callable[..., ProcessRunner]) -> None:
-    pids, took_ms = start(1, "Divisible").run(asking_four(""))  # type: ignore[misc]
+def test_who_is_joined_by_nobody_does_the_rest_itself(start: Callable[..., ProcessRunner], tmp_path: Path) -> None:
+    runner, begun = start(2, "Divisible"), tmp_path / "begun"
+    busy = threading.Thread(target=lambda: runner.run(asking(f"wait {begun}")))
+    busy.start()
+    until(begun.exists)
+    pids, took_ms = runner.run(asking_four(""))  # type: ignore[misc]
     assert len(pids) == 4
     assert len(set(pids)) == 1
     # One part after the other.
     assert took_ms == 2.0
+    busy.join()
+
+
+@pytest.mark.parametrize(("processes", "asked"), [(1, asking_four("pid")), (2, asking("pid"))])
+def test_what_cannot_be_divided_is_run_whole(start: Callable[..., ProcessRunner], processes: int, asked: FrameSet) -> None:
+    _, warm = start(processes, "Divisible").run(asked)  # type: ignore[misc]
+    assert warm == 0
 
 
 @pytest.mark.parametrize("where", range(4))
