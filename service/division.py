@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 DEAR = 1.08
 """Processor time of a set that is divided in two over that of one that is not: NumPy's calls are as many for half the boxes."""
-MOST_LOAD = 0.71
+MOST_LOAD = 0.75
 """Of all processes' time, counted in whole sets. Beyond it sets that are divided, whose processes wait for one another, would
 fall behind: measured on two cores (docs: operations)."""
 _NEW = 0.1
