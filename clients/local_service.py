@@ -38,10 +38,7 @@ def running_service(
     options: further arguments of ``quadlift serve``. program: what takes them instead. variables: added to its environment.
     Raises LocalServiceError with its log when it does not start.
     """
-    # The `service` beside this package, and no folder of that name in the working directory.
-    beside = str(Path(__file__).resolve().parents[1])
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [beside, os.environ.get("PYTHONPATH")]))}
-    environment |= variables or {}
+    environment = child_environment() | dict(variables or {})
     command = [sys.executable, "-P", "-c", program, "serve"]
     command += ["--host", HOST, "--port", str(port), "--site", str(site_file), *options]
     with tempfile.TemporaryFile() as log:
@@ -56,6 +53,15 @@ def running_service(
             raise LocalServiceError(f"{error} The service's last words:\n{_tail(log)}") from error
         finally:
             _stop(child)
+
+
+def child_environment() -> dict[str, str]:
+    """The environment in which a child process finds the packages beside this one.
+
+    Start it with ``-P``, or in another folder: otherwise it takes those of the working directory.
+    """
+    beside = str(Path(__file__).resolve().parents[1])
+    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [beside, os.environ.get("PYTHONPATH")]))}
 
 
 def free_port(wanted: int) -> int:

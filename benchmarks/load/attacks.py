@@ -21,7 +21,7 @@ from benchmarks.load.honest import HonestClient, compare
 from benchmarks.load.target_service import Target, put_sites, read_counters, serving
 from clients.client import ServiceError
 from clients.clip import Clip, open_clip
-from clients.local_service import LocalServiceError
+from clients.local_service import LocalServiceError, child_environment
 
 SCHEMATHESIS = "from schemathesis.cli import schemathesis; schemathesis()"
 _SLACK_S = 45.0
@@ -72,12 +72,10 @@ def attacker(name: str) -> Attack:
 
 async def _run(command: list[str], folder: Path, seconds: float) -> tuple[int | None, str]:
     """What a process said, and its exit code; None when it had to be ended."""
-    beside = str(Path(__file__).resolve().parents[2])
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [beside, os.environ.get("PYTHONPATH")]))}
     child = await asyncio.create_subprocess_exec(
         *command,
         cwd=folder,
-        env=environment,
+        env=child_environment(),
         start_new_session=True,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.STDOUT,

@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import importlib.util
 import logging
-import os
 import re
 import subprocess
 import sys
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from benchmarks.load.mutation import MAX_INPUT, Crash, FuzzResult
+from clients.local_service import child_environment
 
 if TYPE_CHECKING:
     # Not when it runs: what is imported before Atheris instruments it is not followed.
@@ -54,11 +54,10 @@ def guided_fuzz(target: ParserTarget, runs: int, seconds: float, seed: int) -> F
             f"-max_total_time={max(1, round(seconds))}", "-timeout=10", f"-dict={words}", f"-artifact_prefix={found}/",
             str(corpus),
         ]  # fmt: skip
-        beside = str(Path(__file__).resolve().parents[2])
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [beside, os.environ.get("PYTHONPATH")]))}
         began = time.perf_counter()
         try:
-            ended = subprocess.run(command, capture_output=True, timeout=seconds + _SLACK_S, env=environment, check=False)
+            limit_s = seconds + _SLACK_S
+            ended = subprocess.run(command, capture_output=True, timeout=limit_s, env=child_environment(), check=False)
             words_said = ended.stderr
         except subprocess.TimeoutExpired as late:
             words_said = late.stderr or b""

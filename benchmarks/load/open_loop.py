@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import itertools
 import json
-import os
 import random
 import sys
 import time
@@ -17,7 +16,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -25,6 +23,7 @@ import msgpack
 
 from benchmarks.load.parsers import BOUNDARY, multipart_form
 from clients.clip import open_clip
+from clients.local_service import child_environment
 
 PROGRAM = "from benchmarks.load.open_loop import main; main()"
 MULTIPART = f"multipart/form-data; boundary={BOUNDARY.decode()}"
@@ -89,14 +88,23 @@ class PostOutcome:
         """Requests answered 200 within the schedule, a second: what still waited at its end is no throughput."""
         return self.in_time / self.seconds if self.seconds else 0.0
 
+    def add(self, later: PostOutcome) -> None:
+        """Count those of another turn with these."""
+        self.offered += later.offered
+        for status, count in later.statuses.items():
+            self.statuses[status] = self.statuses.get(status, 0) + count
+        self.latencies_ms += later.latencies_ms
+        self.busy_without_retry_after += later.busy_without_retry_after
+        self.in_time += later.in_time
+        self.seconds += later.seconds
+        self.cpu_s += later.cpu_s
+
 
 async def post_load(jobs: Sequence[PostJob], seconds: float) -> list[PostOutcome]:
     """The outcomes of clients that post side by side for a time. Raises LoadError."""
-    beside = str(Path(__file__).resolve().parents[2])
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [beside, os.environ.get("PYTHONPATH")]))}
     pipe = asyncio.subprocess.PIPE
     command = [sys.executable, "-P", "-c", PROGRAM]
-    process = await asyncio.create_subprocess_exec(*command, env=environment, stdin=pipe, stdout=pipe, stderr=pipe)
+    process = await asyncio.create_subprocess_exec(*command, env=child_environment(), stdin=pipe, stdout=pipe, stderr=pipe)
     order = json.dumps({"jobs": [asdict(job) for job in jobs], "seconds": seconds}).encode()
     try:
         async with asyncio.timeout(seconds + max(job.timeout_s for job in jobs) + _SLACK_S):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -28,46 +27,6 @@ PEAK_CONNECTIONS = 4
 _OVERLOAD_CONNECTIONS = 128
 
 
-@dataclass
-class Phase:
-    """All turns of one load."""
-
-    offered: int = 0
-    in_time: int = 0
-    seconds: float = 0.0
-    cpu_s: float = 0.0
-    statuses: Counter[int] = field(default_factory=Counter)
-    latencies_ms: list[float] = field(default_factory=list)
-    busy_without_retry_after: int = 0
-
-    def add(self, outcome: PostOutcome) -> None:
-        """One turn."""
-        self.offered += outcome.offered
-        self.in_time += outcome.in_time
-        self.seconds += outcome.seconds
-        self.cpu_s += outcome.cpu_s
-        self.statuses.update(outcome.statuses)
-        self.latencies_ms += outcome.latencies_ms
-        self.busy_without_retry_after += outcome.busy_without_retry_after
-
-    @property
-    def goodput_hz(self) -> float:
-        """Requests answered 200 within the schedules, a second."""
-        return self.in_time / self.seconds
-
-    def document(self) -> dict[str, Any]:
-        """JSON-ready."""
-        p50, p99 = np.percentile(self.latencies_ms or [float("nan")], [50, 99])
-        return {
-            "offered_hz": round(self.offered / self.seconds, 2),
-            "goodput_hz": round(self.goodput_hz, 2),
-            "latency_ms": {"p50": round(float(p50), 1), "p99": round(float(p99), 1)},
-            "statuses": {str(status): count for status, count in sorted(self.statuses.items())},
-            "busy_without_retry_after": self.busy_without_retry_after,
-            "generator_cores": round(self.cpu_s / self.seconds, 3),
-        }
-
-
 async def measure_overload(seconds: float) -> dict[str, Any]:
     """Goodput and latency of what is accepted at twice and five times the peak, by POST and over camera streams.
 
@@ -76,7 +35,7 @@ async def measure_overload(seconds: float) -> dict[str, Any]:
     clip = open_clip()
     cameras = {camera: camera for camera in clip.camera_ids}
     turn_s = seconds / (ROUNDS * (len(FACTORS) + 2))
-    phases = {factor: Phase() for factor in (1, *FACTORS)}
+    phases = {factor: PostOutcome() for factor in (1, *FACTORS)}
     streamed: list[dict[str, Any]] = []
     async with serving(clip.site) as target:
 
@@ -102,12 +61,12 @@ async def _streamed(target: Target, seconds: float, rate_hz: float) -> dict[str,
     return {"seconds": seconds, "dropped": drops(before, after), **said}
 
 
-def _figures(phases: dict[int, Phase], streamed: list[dict[str, Any]]) -> dict[str, Any]:
+def _figures(phases: dict[int, PostOutcome], streamed: list[dict[str, Any]]) -> dict[str, Any]:
     deadline_ms = Settings.model_fields["deadline_ms"].default
     peak_hz = phases[1].goodput_hz
     overloads = {}
     for factor in FACTORS:
-        figures = phases[factor].document()
+        figures = _document(phases[factor])
         kept = phases[factor].goodput_hz / peak_hz
         overloads[f"{factor}x"] = figures | {
             "goodput_ratio": round(kept, 3),
@@ -123,7 +82,7 @@ def _figures(phases: dict[int, Phase], streamed: list[dict[str, Any]]) -> dict[s
         "deadline_ms": deadline_ms,
         "min_goodput_ratio": MIN_GOODPUT,
         "max_p99_ms": MAX_DEADLINES * deadline_ms,
-        "peak": phases[1].document(),
+        "peak": _document(phases[1]),
         "overload": overloads,
         "streams_2x": {
             "sent": sent,
@@ -137,4 +96,17 @@ def _figures(phases: dict[int, Phase], streamed: list[dict[str, Any]]) -> dict[s
             "unexplained": max(0, sent - answered - sum(dropped.values())),
         },
         "passed": all(figures["passed"] for figures in overloads.values()),
+    }
+
+
+def _document(phase: PostOutcome) -> dict[str, Any]:
+    """All turns of one load, JSON-ready."""
+    p50, p99 = np.percentile(phase.latencies_ms or [float("nan")], [50, 99])
+    return {
+        "offered_hz": round(phase.offered / phase.seconds, 2),
+        "goodput_hz": round(phase.goodput_hz, 2),
+        "latency_ms": {"p50": round(float(p50), 1), "p99": round(float(p99), 1)},
+        "statuses": {str(status): count for status, count in sorted(phase.statuses.items())},
+        "busy_without_retry_after": phase.busy_without_retry_after,
+        "generator_cores": round(phase.cpu_s / phase.seconds, 3),
     }

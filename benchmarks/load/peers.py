@@ -23,7 +23,7 @@ from benchmarks.load.peer_model import SITE_FILE
 from benchmarks.load.process_tree import tree_usage
 from benchmarks.load.target_service import target_service
 from clients.clip import open_clip
-from clients.local_service import HOST, STOP_TIMEOUT_S, free_port
+from clients.local_service import HOST, STOP_TIMEOUT_S, child_environment, free_port
 from service.settings import usable_cores
 from service.site import parse_site, save_site
 
@@ -213,10 +213,7 @@ def peer(name: str, module: str, options: Sequence[str], site_file: Path) -> Ite
         {camera: camera for camera in clip.camera_ids},
         content_type=MSGPACK if is_mosec else MULTIPART,
     )
-    beside = str(Path(__file__).resolve().parents[2])
-    environment = os.environ | {
-        SITE_FILE: str(site_file), "PYTHONPATH": os.pathsep.join(filter(None, [beside, os.environ.get("PYTHONPATH")])),
-    }  # fmt: skip
+    environment = child_environment() | {SITE_FILE: str(site_file)}
     with tempfile.TemporaryFile() as log:
         process = subprocess.Popen(command, env=environment, stdout=log, stderr=log, start_new_session=True)
         try:

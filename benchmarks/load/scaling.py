@@ -100,15 +100,16 @@ async def measure_cameras(seconds: float) -> dict[str, Any]:
     clip = open_clip()
     sites = {count: repeated_site(clip, f"cameras-{count}", count) for count in CAMERAS}
     turn_s = seconds / (ROUNDS * len(CAMERAS))
-    done: dict[int, list[PostOutcome]] = {count: [] for count in CAMERAS}
+    done = {count: PostOutcome() for count in CAMERAS}
     async with serving(sites[4].document) as target:
         await put_sites(target.url, {site.id: site.document for site in sites.values()})
         for number in range(ROUNDS + 1):
             for count, site in sites.items():
                 outcome = (await post_load([_job(target.url, site, 0.0, PEAK_CONNECTIONS)], turn_s if number else 1.0))[0]
                 # The first time only warms up.
-                done[count] += [outcome] if number else []
-    rates = {count: sum(one.goodput_hz for one in turns) / ROUNDS for count, turns in done.items()}
+                if number:
+                    done[count].add(outcome)
+    rates = {count: turns.goodput_hz for count, turns in done.items()}
     cost_ms = {count: 1e3 * usable_cores() / (rate * count) if rate else float("nan") for count, rate in rates.items()}
     growth = cost_ms[16] / cost_ms[4]
     return {
@@ -116,15 +117,6 @@ async def measure_cameras(seconds: float) -> dict[str, Any]:
         "core_ms_per_camera": {str(count): round(cost, 2) for count, cost in cost_ms.items()},
         "growth_16_to_4": round(growth, 3),
         "max_growth": MAX_COST,
-        "statuses": {str(count): dict(sum_statuses(turns)) for count, turns in done.items()},
+        "statuses": {str(count): turns.statuses for count, turns in done.items()},
         "passed": growth <= MAX_COST,
     }
-
-
-def sum_statuses(turns: Sequence[PostOutcome]) -> dict[str, int]:
-    """Answers of several turns by status."""
-    sums: dict[str, int] = {}
-    for turn in turns:
-        for status, count in turn.statuses.items():
-            sums[str(status)] = sums.get(str(status), 0) + count
-    return sums

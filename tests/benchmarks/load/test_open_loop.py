@@ -111,3 +111,10 @@ def test_a_response_without_a_length_is_none_that_can_be_read() -> None:
             await read_answer(reader)
 
     asyncio.run(read())
+
+
+def test_turns_are_counted_together() -> None:
+    first = PostOutcome(offered=5, statuses={200: 3, 503: 1}, latencies_ms=[1.0], in_time=3, seconds=2.0, cpu_s=0.5)
+    first.add(PostOutcome(offered=2, statuses={200: 2}, latencies_ms=[2.0], busy_without_retry_after=1, in_time=1, seconds=2.0))
+    assert first == PostOutcome(7, {200: 5, 503: 1}, [1.0, 2.0], 1, 4, 4.0, 0.5)
+    assert first.goodput_hz == 1.0

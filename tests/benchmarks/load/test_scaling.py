@@ -6,8 +6,7 @@ import math
 
 import pytest
 
-from benchmarks.load.open_loop import PostOutcome
-from benchmarks.load.scaling import jain, repeated_site, sum_statuses
+from benchmarks.load.scaling import jain, repeated_site
 from clients.clip import open_clip
 from service.site import parse_site
 
@@ -25,7 +24,3 @@ def test_a_site_of_as_many_cameras_as_wanted(count: int) -> None:
     site = repeated_site(clip, "many", count)
     assert len(parse_site(dict(site.document)).cameras) == len(site.cameras) == count
     assert set(site.cameras.values()) == set(clip.camera_ids[:count])
-
-
-def test_sums_of_turns() -> None:
-    assert sum_statuses([PostOutcome(statuses={200: 3, 503: 1}), PostOutcome(statuses={200: 2})]) == {"200": 5, "503": 1}
