@@ -80,7 +80,7 @@ class SetResult:
     per_camera: list[Boxes]
     """Each camera's own lifted boxes, in the order of ``camera_ids``."""
     detections: dict[str, int]
-    """2D detections a camera."""
+    """Boxes a camera, before fusion."""
     timing_ms: dict[str, float]
     """Wall time of each step."""
     failed: dict[str, FrameError]
@@ -157,7 +157,6 @@ class Pipeline:
             terms=terms,
             camera_index=index,
             hard=hard,
-            detections=tuple(len(detections) for detections in found),
             timing_ms=timing,
             failed=failed,
         )
@@ -174,13 +173,14 @@ class Pipeline:
             fused = self._fuse(sightings, site)
             keep = self._reported(fused.boxes)
         timing["total"] = before + 1e3 * (time.perf_counter() - started)
+        own = [sightings.boxes.take(index == number) for number in range(len(cameras))]
         return SetResult(
             boxes=fused.boxes.take(keep),
             members=fused.members[keep],
             camera_ids=tuple(camera.id for camera in cameras),
             classes=self.classes,
-            per_camera=[sightings.boxes.take(index == number) for number in range(len(cameras))],
-            detections={camera.id: count for camera, count in zip(cameras, sightings.detections, strict=True)},
+            per_camera=own,
+            detections={camera.id: len(boxes) for camera, boxes in zip(cameras, own, strict=True)},
             timing_ms=timing,
             failed=sightings.failed,
             parts=None if fused.parts is None else sightings.timed(fused.parts.of_rows(keep)),

@@ -31,8 +31,6 @@ class Sightings:
     """(N,) into ``cameras``."""
     hard: frozenset[str]
     """Cameras in which the depth-guided detector ran."""
-    detections: tuple[int, ...]
-    """(C) 2D detections."""
     timing_ms: dict[str, float]
     """Wall time of each step, and of all under ``total``."""
     failed: dict[str, FrameError]
@@ -41,7 +39,7 @@ class Sightings:
     @staticmethod
     def of_none(failed: dict[str, FrameError]) -> Sightings:
         """Where not one frame could be decoded."""
-        return Sightings((), (), Boxes.empty(), None, np.zeros(0, np.int64), frozenset(), (), {"total": 0.0}, failed)
+        return Sightings((), (), Boxes.empty(), None, np.zeros(0, np.int64), frozenset(), {"total": 0.0}, failed)
 
     @staticmethod
     def together(parts: Sequence[Sightings], *, side_by_side: bool = True) -> Sightings:
@@ -63,7 +61,6 @@ class Sightings:
             terms=BoxProblem.concatenate(terms) if terms and len(terms) == len(with_boxes) else None,
             camera_index=np.concatenate([part.camera_index + start for part, start in zip(parts, first, strict=False)]),
             hard=frozenset().union(*(part.hard for part in parts)),
-            detections=tuple(count for part in parts for count in part.detections),
             timing_ms={step: time_of([part.timing_ms.get(step, 0.0) for part in parts]) for step in steps},
             failed={camera: error for part in parts for camera, error in part.failed.items()},
         )
