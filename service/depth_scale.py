@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from service.geometry.camera import Camera
 from service.geometry.ground import Ground
-from service.geometry.transforms import Array
+from service.geometry.transforms import Array, between
 from service.nets.depth import InverseDepth, ReadingError
 
 NEAREST_M, FARTHEST_M = 4.0, 80.0
@@ -107,12 +107,13 @@ def read_boxes(inverse: InverseDepth, scale: DepthScale | None, xyxy_px: Array, 
     # A grid of points over the middle half, the same number for every box, so that all medians are one operation.
     x = xyxy_px[:, None, 0] + (xyxy_px[:, None, 2] - xyxy_px[:, None, 0]) * _MIDDLE_HALF
     y = xyxy_px[:, None, 1] + (xyxy_px[:, None, 3] - xyxy_px[:, None, 1]) * _MIDDLE_HALF
-    column = np.minimum(np.maximum(np.floor((x + 0.5) / inverse.stride).astype(np.int64), 0), columns - 1)
-    row = np.minimum(np.maximum(np.floor((y + 0.5) / inverse.stride).astype(np.int64), 0), rows - 1)
+    column = between(np.floor((x + 0.5) / inverse.stride), 0, columns - 1).astype(np.int64)
+    row = between(np.floor((y + 0.5) / inverse.stride), 0, rows - 1).astype(np.int64)
     values = inverse.values[row[:, :, None], column[:, None, :]].reshape(len(xyxy_px), -1)
-    # Their number is odd: the median is one of them. NaN sorts last, so a few do not spoil it.
+    # Their number is odd, so the median is one of them. NaN sorts last: where there is any, there is no reading.
     half = values.shape[1] // 2
-    middle = np.partition(values, half, axis=1)[:, half]
+    ordered = np.partition(values, (half, -1), axis=1)
+    middle = np.where(np.isnan(ordered[:, -1]), np.nan, ordered[:, half])
     inverse_m = scale.scale * middle + scale.shift
     usable = inverse_m > 1.0 / FARTHEST_M
     depth = np.where(usable, 1.0 / np.where(usable, inverse_m, 1.0), np.nan) / (1.0 + error.bias)

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from service.geometry.boxes import BORDER_PX, TANGENT_DIRECTIONS, Boxes, box_corners, extents_of, tangents_of
 from service.geometry.camera import MIN_DEPTH_M, Camera
 from service.geometry.ground import Ground
-from service.geometry.transforms import Array, transform_points, wrap_angle
-from service.measurements import EdgeMeasurements, Measurements, between, edge_measurements
+from service.geometry.transforms import Array, between, transform_points, wrap_angle
+from service.measurements import EdgeMeasurements, Measurements, edge_measurements
 from service.residuals import FIXED_ROWS, GROUND, BoxProblem
 from service.solver import SolverSettings, covariance_of, solve
 

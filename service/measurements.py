@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from service.geometry.boxes import TANGENT_DIRECTIONS
 from service.geometry.camera import Camera
-from service.geometry.transforms import Array, wrap_angle
+from service.geometry.transforms import Array, between, wrap_angle
 from service.solver import MAX_DIM_M, MIN_DIM_M
 
 _MIN_SIGMA_PX, _MIN_SIGMA_M, _MIN_SIGMA_RAD = 0.25, 0.01, 0.005
@@ -143,12 +143,6 @@ def _tangents(K: Array, reach_px: Array, sigma_px: Array) -> tuple[Array, Array,
     length = np.sqrt((scaled * scaled).sum(2))
     reach = (reach_px - K[:, :2, 2] @ TANGENT_DIRECTIONS.T) / length
     return scaled / length[..., None], reach, length / between(sigma_px, _MIN_SIGMA_PX, _MAX_SIGMA_PX)
-
-
-def between(values: Array, low: float, high: float) -> Array:
-    """``np.clip``, whose checks of its arguments cost more than its work on a few boxes."""
-    clipped: Array = np.minimum(np.maximum(values, low), high)
-    return clipped
 
 
 def _middles(xyxy: Array) -> Array:

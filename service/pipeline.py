@@ -167,7 +167,8 @@ class Pipeline:
         sightings = Sightings.together(seen)
         if not sightings.cameras:
             raise next(iter(sightings.failed.values()))
-        timing, cameras, index = sightings.timing_ms, sightings.cameras, sightings.camera_index
+        cameras, index = sightings.cameras, sightings.camera_index
+        timing = dict(sightings.timing_ms)
         before = timing.pop("total")
         with _timed(timing, "fuse"):
             fused = self._fuse(sightings, site)

@@ -51,7 +51,7 @@ class Sightings:
             return parts[0]
         with_boxes = [part for part in parts if len(part.boxes)]
         terms = [part.terms for part in with_boxes if part.terms is not None]
-        first = np.cumsum([0, *(len(part.cameras) for part in parts)])
+        first = np.cumsum([0, *(len(part.cameras) for part in parts[:-1])])
         time_of = max if side_by_side else sum
         steps = dict.fromkeys(step for part in parts for step in part.timing_ms)
         return Sightings(
@@ -59,7 +59,7 @@ class Sightings:
             captured_at_ns=tuple(moment for part in parts for moment in part.captured_at_ns),
             boxes=Boxes.concatenate([part.boxes for part in parts]),
             terms=BoxProblem.concatenate(terms) if terms and len(terms) == len(with_boxes) else None,
-            camera_index=np.concatenate([part.camera_index + start for part, start in zip(parts, first, strict=False)]),
+            camera_index=np.concatenate([part.camera_index + start for part, start in zip(parts, first, strict=True)]),
             hard=frozenset().union(*(part.hard for part in parts)),
             timing_ms={step: time_of([part.timing_ms.get(step, 0.0) for part in parts]) for step in steps},
             failed={camera: error for part in parts for camera, error in part.failed.items()},

@@ -35,8 +35,9 @@ if TYPE_CHECKING:
 
 _PRELOADED = ["service.pipeline", "service.nets.pack", "service.runners"]
 _MAX_KNOWN_SITES = 256
-"""Sites that a process keeps by heart; beyond that it begins anew. A site is sent once, not with every frame set."""
-_END_S = 2.0
+"""Sites that a process keeps by heart; beyond that it begins anew."""
+END_S = 2.0
+"""For a process to end, of itself or killed."""
 _SITE, _GROUND = "site", "ground"
 
 
@@ -253,7 +254,7 @@ class WorkerProcess:
 
     def exit_code(self) -> int | None:
         """Of a process that ends just now; None where it does not."""
-        wait([self._process.sentinel], _END_S)
+        wait([self._process.sentinel], END_S)
         with _ENDS:
             return self._process.exitcode
 

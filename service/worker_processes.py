@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from service.division import Division
 from service.frames import FrameSet
-from service.worker_process import EndedError, WorkerProcess, as_answered
+from service.worker_process import END_S, EndedError, WorkerProcess, as_answered
 
 if TYPE_CHECKING:
     from service.pipeline import SetResult
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_END_S = 2.0
 _RETRY_S = 1.0
 """Before another try where a process could not be started."""
 
@@ -163,7 +162,7 @@ class ProcessRunner:
             process.end()
         for process in busy:
             process.kill()
-        until = time.monotonic() + _END_S
+        until = time.monotonic() + END_S
         for process in idle:
             process.join(until - time.monotonic())
 

@@ -23,8 +23,6 @@ from service.schemas import CAPTURED_AT, Detections, ErrorMessage, ns_from_rfc33
 from service.site import Site
 from service.telemetry import Drop
 
-router = APIRouter(tags=["frames"])
-
 T = TypeVar("T")
 _LIGHT_BODY_BYTES = 256 * 1024
 """A form of this length is parsed within half a millisecond."""
@@ -58,7 +56,7 @@ class DetectQuery(BaseModel):
 class _Direct(APIRoute):
     """Calls its endpoint with the request alone; the signature is for the OpenAPI document.
 
-    Solving dependencies anew for each request costs a tenth of what this process spends on a frame set.
+    Solving dependencies anew for each request took a quarter of the event loop's time (cProfile: 0.29 of 1.15 s).
     """
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
@@ -76,6 +74,14 @@ class _Direct(APIRoute):
         return handle
 
 
+router = APIRouter(tags=["frames"], route_class=_Direct)
+
+
+@router.post(
+    "/detect",
+    openapi_extra=_REQUEST_BODY,
+    responses={200: {"model": Detections}, **{code: {"model": ErrorMessage} for code in (404, 408, 413, 422, 503, 504)}},
+)
 async def detect(request: Request, query: Annotated[DetectQuery, Query()]) -> Response:
     """Boxes of one frame set: one to N of the site's cameras, each as a file part named by the camera's id.
 
@@ -95,16 +101,6 @@ async def detect(request: Request, query: Annotated[DetectQuery, Query()]) -> Re
     sequence = service.live.site(query.site).next_sequence()
     content = await answer(service, FrameSet(known_site, frames, captured_at_ns, sequence), per_camera=query.per_camera)
     return Response(content, media_type="application/json")
-
-
-router.add_api_route(
-    "/detect",
-    detect,
-    methods=["POST"],
-    route_class_override=_Direct,
-    openapi_extra=_REQUEST_BODY,
-    responses={200: {"model": Detections}, **{code: {"model": ErrorMessage} for code in (404, 408, 413, 422, 503, 504)}},
-)
 
 
 async def answer(service: Service, frame_set: FrameSet, *, per_camera: bool = False, newest_wins: bool = False) -> bytes:

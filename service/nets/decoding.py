@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.geometry.transforms import Array
+from service.geometry.transforms import Array, between
 from service.nets.detections import Detections
 from service.nets.detector_spec import DROPPED, DetectorSpec
 
@@ -177,7 +177,7 @@ class _AnchoredCells:
 
 def _anchored_cells(heads: Outputs, spec: DetectorSpec, threshold: float) -> _AnchoredCells:
     """Cells whose objectness passes; a score is at most its objectness."""
-    logits, cells, counts = [], [], []
+    logits, cells, sizes = [], [], []
     least = _logit(threshold)
     for head, anchors in zip(heads, spec.anchors_px, strict=True):
         grid = head.reshape(len(anchors), BOX_FIELDS + spec.network_classes, *head.shape[-2:])
@@ -185,17 +185,14 @@ def _anchored_cells(heads: Outputs, spec: DetectorSpec, threshold: float) -> _An
         # Three times as quick as `nonzero` of three axes.
         anchor, row, column = np.unravel_index(np.flatnonzero(passes), passes.shape)
         logits.append(grid[anchor, :, row, column])
-        cells.append(np.array([column, row, anchor]))
-        counts.append(len(anchor))
-    column, row, anchor = np.concatenate(cells, 1)
-    level = np.repeat(np.arange(len(heads)), counts)
-    sizes = np.array([size for anchors in spec.anchors_px for size in anchors], dtype=np.float64)
-    first = np.cumsum([0, *(len(anchors) for anchors in spec.anchors_px)])
+        cells.append(np.stack([column, row], 1))
+        sizes.append(np.asarray(anchors, dtype=np.float64)[anchor])
+    strides = np.repeat(np.array(spec.strides, dtype=np.float64), [len(own) for own in cells])
     return _AnchoredCells(
         np.concatenate(logits).astype(np.float64),
-        np.stack([column, row], 1).astype(np.float64),
-        sizes[first[level] + anchor],
-        np.array(spec.strides, dtype=np.float64)[level, None],
+        np.concatenate(cells).astype(np.float64),
+        np.concatenate(sizes),
+        strides[:, None],
     )
 
 
@@ -241,7 +238,7 @@ def _box(center: Array, size: Array) -> Array:
 
 
 def _sigmoid(logits: Array) -> Array:
-    return np.asarray(1.0 / (1.0 + np.exp(-np.minimum(np.maximum(logits, -500.0), 500.0))))
+    return np.asarray(1.0 / (1.0 + np.exp(-between(logits, -500.0, 500.0))))
 
 
 def _logit(probability: float) -> float:

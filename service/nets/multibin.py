@@ -256,7 +256,7 @@ def crop_vehicles(image: NDArray[np.uint8], xyxy_px: ArrayLike, crop_px: int) ->
         window = image[max(top, 0) : max(min(bottom, height), 0), max(left, 0) : max(min(right, width), 0)]
         if window.shape[:2] != (side, side):
             window = _padded(window, side, max(-left, 0), max(-top, 0))
-        crops[row] = _shrunk(window, crop_px)
+        _shrink(window, crops[row])
     return crops
 
 
@@ -266,15 +266,15 @@ def _padded(inside: NDArray[np.uint8], side: int, x: int, y: int) -> NDArray[np.
         return np.full((side, side, 3), PAD_VALUE, np.uint8)
     height, width = inside.shape[:2]
     edges = (y, side - y - height, x, side - x - width)
-    square = cv2.copyMakeBorder(inside, *edges, cv2.BORDER_CONSTANT | cv2.BORDER_ISOLATED, value=(PAD_VALUE,) * 3)
+    square = cv2.copyMakeBorder(inside, *edges, cv2.BORDER_CONSTANT, value=(PAD_VALUE,) * 3)
     return np.asarray(square, dtype=np.uint8)
 
 
-def _shrunk(window: NDArray[np.uint8], crop_px: int) -> NDArray[np.uint8]:
-    """A square window (side, side, 3) at the size of a crop."""
+def _shrink(window: NDArray[np.uint8], crop: NDArray[np.uint8]) -> None:
+    """A square window (side, side, 3) into a crop (S, S, 3)."""
     # Averaging over areas costs up to ten times as much and shows in no figure until crops shrink by more than this; but
     # over 2x2 pixels it is cheap. An odd row or column that this leaves out is less than a pixel of the crop.
-    while (side := window.shape[0]) > _MAX_SHRINK * crop_px:
+    while (side := window.shape[0]) > _MAX_SHRINK * crop.shape[0]:
         half = side // 2
         window = cv2.resize(window[: 2 * half, : 2 * half], (half, half), interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
-    return np.asarray(cv2.resize(window, (crop_px, crop_px), interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+    cv2.resize(window, crop.shape[:2], dst=crop, interpolation=cv2.INTER_LINEAR)

@@ -90,6 +90,15 @@ def test_a_known_bias_is_taken_off() -> None:
     np.testing.assert_allclose(reading.sigma_m, 1.0, rtol=1e-6)
 
 
+def test_where_the_map_is_no_number_there_is_no_reading() -> None:
+    values = np.full_like(road_map(1.0, 0.0), 0.1)
+    scale = DepthScale(1.0, 0.0, 0.0)
+    assert np.isfinite(read_boxes(InverseDepth(values, STRIDE), scale, BOX, UNBIASED).depth_m).all()
+    x, y = (0.5 * (BOX[0, :2] + BOX[0, 2:]) / STRIDE).astype(int)
+    values[y, x] = np.nan
+    assert np.isnan(read_boxes(InverseDepth(values, STRIDE), scale, BOX, UNBIASED).depth_m).all()
+
+
 def test_without_a_scale_there_are_no_readings() -> None:
     readings = read_boxes(InverseDepth(road_map(1.0, 0.0), STRIDE), None, np.zeros((3, 4)), UNBIASED)
     assert np.isnan(readings.depth_m).all()

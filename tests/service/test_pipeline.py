@@ -137,6 +137,13 @@ def test_a_set_in_parts_gives_the_same_answer(pipeline: Pipeline, count: int) ->
     assert (again.parts.captured_at_ns == whole.parts.captured_at_ns).all()
 
 
+def test_fusing_leaves_what_was_seen_as_it_is(pipeline: Pipeline) -> None:
+    seen = pipeline.see(frame_set(40))
+    first, second = (pipeline.fuse(frame_set(40).site, [seen]) for _ in range(2))
+    assert (first.boxes.center == second.boxes.center).all()
+    assert first.timing_ms.keys() == second.timing_ms.keys()
+
+
 def test_a_part_whose_frames_are_damaged_leaves_the_others(pipeline: Pipeline) -> None:
     whole = frame_set(40)
     torn = [replace(frame, data=frame.data[:2000]) for frame in whole.frames[:2]]
