@@ -14,8 +14,9 @@ from models_export.data.detection import DetectionSample
 from models_export.data.real import RealData
 from models_export.data.samples import Sample, load_samples, split_scenes
 from models_export.guided import GuidedRecipe
+from models_export.train import exported
 from models_export.train.checkpoint import load_checkpoint
-from models_export.train.config import TrainConfig
+from models_export.train.config import TrainConfig, nested_tuples
 from models_export.train.loop import fit
 from models_export.train.task import Task
 from service.errors import InputError
@@ -117,9 +118,9 @@ def train(
 ) -> nn.Module:
     """Train one network on the training scenes of ``data``; checkpoint, logs and curves go to ``out``.
 
-    real: recordings, for the networks that learn from them too. init: a file or folder of weights to start from; not read
-    when resuming. Raises InputError for an unknown network, too little data, and weights that do not fit, NotFoundError for
-    recordings that are not there.
+    real: recordings, for the networks that learn from them too. init: a file or folder of weights to start from, or a pack's
+    ONNX file of this network; when resuming, only the latter is read. Raises InputError for an unknown network, too little
+    data, and weights that do not fit, NotFoundError for recordings that are not there.
     """
     network = recipe.network(name)
     training, held_out = (recipe.samples(scenes) for scenes in split_scenes(data))
@@ -128,18 +129,22 @@ def train(
     # Before the network is made: its first weights are drawn.
     torch.manual_seed(network.training.seed)
     task = network.task([*training, *added], network.config)
-    if init is not None and not resume:
+    before = None
+    if init is not None and init.suffix == exported.SUFFIX:
+        # When resuming, too: the priors that its weights are bound to are part of the run.
+        exported.load_exported(task, init)
+        before = exported.provenance(init)
+    elif init is not None and not resume:
         network.load_pretrained(task.net, init)
     config = replace(
-        network.training, init=None if init is None else init.name, recordings=real.credits() if real and added else ()
+        network.training,
+        init=None if init is None else init.name,
+        before=before,
+        recordings=real.credits() if real and added else (),
     )
     return fit(task, config, out, task.held_out([*held_out, *checked]), resume=resume)
 
 
 def resolved_config(network: NetworkRecipe, saved: Mapping[str, Any]) -> Any:
     """The configuration that a checkpoint's network was trained with."""
-    return replace(network.config, **{key: _tuples(value) for key, value in saved.items()})
-
-
-def _tuples(rows: Any) -> Any:
-    return tuple(_tuples(row) for row in rows) if isinstance(rows, list | tuple) else rows
+    return replace(network.config, **{key: nested_tuples(value) for key, value in saved.items()})

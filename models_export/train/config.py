@@ -75,6 +75,8 @@ class TrainConfig:
     """Items of each camera and of each weather that validate, at most."""
     init: str | None = None
     """Name of the file or folder whose weights training starts from, for the record."""
+    before: Mapping[str, Any] | None = None
+    """How those weights came about, when they are a pack's and its manifest says so, for the record."""
     recordings: tuple[str, ...] = ()
     """Real recordings that train too, with their authors and licences, for the record."""
 
@@ -102,6 +104,11 @@ class TrainConfig:
         if self.epochs is None:
             return self
         return replace(self, steps=max(math.ceil(self.epochs * items / self.batch_size), 1), epochs=None)
+
+
+def nested_tuples(rows: Any) -> Any:
+    """Lists of lists, as JSON and checkpoints hold them, as the tuples of a frozen configuration."""
+    return tuple(nested_tuples(row) for row in rows) if isinstance(rows, list | tuple) else rows
 
 
 def decisive(config: Mapping[str, Any]) -> dict[str, Any]:

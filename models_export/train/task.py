@@ -31,6 +31,8 @@ class Task(Protocol):
     name: str
     """Names the checkpoint, log and curves."""
     net: nn.Module
+    config: Any
+    """The network's, with what the data decided."""
 
     def __len__(self) -> int:
         """Number of items; an epoch is as many draws."""

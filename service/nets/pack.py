@@ -131,7 +131,7 @@ def load_pack(name_or_path: str, *, provider: Provider = "auto", intra_op_thread
     """
     choice = choose(provider, ort.get_available_providers())
     folder = resolve_pack(name_or_path)
-    manifest = _read_manifest(folder / "manifest.json")
+    manifest = read_manifest(folder / "manifest.json")
     for name in REQUIRED_NETWORKS:
         if name not in manifest.networks:
             raise PackError(f"no network '{name}'.", field=f"{folder.name}/manifest.json", remedy="Export the pack again.")
@@ -177,7 +177,8 @@ def open_network(name: str, model: bytes, intra_op_threads: int = 1, choice: Cho
     return Network(name, session, metadata, settled(choice, session.get_providers(), name))
 
 
-def _read_manifest(path: Path) -> Manifest:
+def read_manifest(path: Path) -> Manifest:
+    """The manifest in a file. Raises PackError naming the field that is wrong."""
     try:
         return Manifest.model_validate_json(path.read_bytes())
     except ValidationError as error:
