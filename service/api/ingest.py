@@ -23,6 +23,9 @@ router = APIRouter()
 
 _POLICY_VIOLATION = 1008
 _GOING_AWAY = 1001
+_PAUSE_S, _MAX_PAUSE_S = 0.01, 0.05
+"""How much longer each refused message of a row, after its first, keeps its connection from being read; and at most. A camera
+that sends rubbish as fast as it can would take the loop's time from the others'; one broken frame costs nothing."""
 _FAREWELL_S = 2.0
 """Time to tell a sender why its connection ends."""
 
@@ -126,6 +129,7 @@ class Connection:
             if self._errors >= self._service.settings.ingest_max_errors:
                 raise _Cut(_POLICY_VIOLATION, error) from None
             await self._answer(error)
+            await asyncio.sleep(min((self._errors - 1) * _PAUSE_S, _MAX_PAUSE_S))
         else:
             self._errors = 0
 

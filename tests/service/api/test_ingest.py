@@ -13,6 +13,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from service.api import ingest
 from service.schemas import Detections, rfc3339_from_ns
 
 
@@ -155,6 +156,26 @@ def test_a_sender_of_nothing_but_errors_is_cut(start: Callable[..., Any]) -> Non
         assert caught.value.rcvd is not None
         assert caught.value.rcvd.code == 1008
     assert drops(client) == {"frame_refused": 3}
+
+
+def test_a_sender_of_rubbish_is_read_slowly_and_one_broken_frame_costs_nothing(
+    client: Any, tools: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ingest, "_PAUSE_S", 0.1)
+    monkeypatch.setattr(ingest, "_MAX_PAUSE_S", 60.0)
+    with open_ingest(client) as socket:
+        began = time.monotonic()
+        for data in (b"rubbish", b"rubbish", b"rubbish", b"rubbish"):
+            socket.send(message("east", time.time_ns(), data))
+            error_of(socket)
+        # 0.1 s after the second, 0.2 s after the third; what comes after the fourth is not waited for.
+        assert time.monotonic() - began >= 0.3
+    monkeypatch.setattr(ingest, "_PAUSE_S", 60.0)
+    with open_ingest(client) as socket:
+        for data in (b"rubbish", tools.jpeg(), b"rubbish", tools.jpeg(), b"rubbish"):
+            socket.send(message("east", time.time_ns(), data))
+        for _ in range(3):
+            error_of(socket)
 
 
 def test_a_slow_sender_is_cut(start: Callable[..., Any], tools: Any) -> None:
