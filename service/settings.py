@@ -63,7 +63,7 @@ class Settings(BaseSettings):
     """A frame set that has waited this long for a worker is answered 503 instead of being run. Milliseconds."""
     run_limit_ms: Annotated[float, Field(gt=0)] | None = None
     """A set of up to four frames that runs for longer is answered 504, and its worker replaced as hung; larger sets may run
-    longer in proportion. Unset: 1500, three times what the warm-up took, or eight times what sets take lately, whichever
+    longer in proportion. Unset: 1500, twice what the warm-up took, or eight times what sets take lately, whichever
     is most. Milliseconds."""
     max_abandoned: Annotated[int, Field(ge=0, le=256)] = 4
     """Threads that may hang while others take their place. One more, and the service is not ready until one comes back."""

@@ -30,8 +30,8 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 _MIN_RUN_LIMIT_S = 1.5
 """With the time between two looks, a worker that hangs is replaced within two seconds."""
-_RUN_LIMIT_WARM_UPS = 3
-"""A warm-up takes about as long as a set of four frames, plus what only the first run takes."""
+_RUN_LIMIT_WARM_UPS = 2
+"""A warm-up takes about as long as two sets of four frames, plus what only the first run takes."""
 _WORK_SHARE = 0.8
 """Of the time to stop: what frame sets may take of it; the rest is for their answers."""
 
