@@ -43,8 +43,9 @@ class StreamLink:
     async def __aenter__(self) -> Self:
         """Connect both. Raises ServiceError."""
         async with contextlib.AsyncExitStack() as stack:
-            self._stream = await stack.enter_async_context(self._connected("stream"))
-            self._ingest = await stack.enter_async_context(self._connected("ingest"))
+            with reaching(self._url):
+                self._stream = await stack.enter_async_context(self._connected("stream"))
+                self._ingest = await stack.enter_async_context(self._connected("ingest"))
             self._listening = asyncio.create_task(self._listen())
             self._open = stack.pop_all()
         return self
