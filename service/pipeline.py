@@ -35,6 +35,9 @@ from service.site import Site
 
 DOUBT = 2.0
 """``FusionSettings.doubt`` of a pipeline, chosen on validation scenes (docs: fusion)."""
+HUBER_SIGMAS = 1.0
+"""``LiftSettings.huber_sigmas`` of a pipeline: a network's outline of a vehicle that is partly hidden is a guess, and wrong
+guesses are far off (validation scenes; docs: lifting)."""
 
 
 _WARM_UP_CROPS = 64
@@ -62,7 +65,7 @@ class PipelineSettings:
     """Fused boxes whose place on the road is less certain (one sigma, both axes together) are dropped: mostly vehicles that one
     camera alone sees, from far away, often beside their own box from the other cameras. ``per_camera`` has them. The paper's
     method knows no such limit."""
-    lift: LiftSettings = field(default_factory=LiftSettings)
+    lift: LiftSettings = field(default_factory=lambda: LiftSettings(huber_sigmas=HUBER_SIGMAS))
     """How exact the ground is, and for fusion the cameras, a site's own ``accuracy`` says."""
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
     fusion: FusionSettings = field(default_factory=lambda: FusionSettings(doubt=DOUBT))
