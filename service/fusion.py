@@ -90,8 +90,8 @@ class FusionSettings:
     doubt: float = 0.0
     """How fast a score falls with what the covariance leaves open of the footprint: exp(-doubt (sigma along the length over the
     length + sigma across over the width)). Boxes that are surely there but not surely *so* then come after those that are."""
-    solver: SolverSettings = field(default_factory=lambda: SolverSettings(step_tolerance=4.0))
-    """For vehicles of several cameras. They start near the solution, where one step takes most of them all the way."""
+    solver: SolverSettings = field(default_factory=SolverSettings)
+    """For vehicles of several cameras."""
 
 
 def fuse(
