@@ -23,6 +23,7 @@ from models_export.nets.blocks import parameter_count
 from models_export.quantize import quantize
 from models_export.recipe import NetworkRecipe, PackRecipe, Precision, resolved_config
 from models_export.train.checkpoint import load_averaged, read_checkpoint
+from models_export.train.exported import training_of
 from models_export.validate import (
     TooFewVehiclesError,
     depth_scores,
@@ -204,11 +205,7 @@ class _Job:
         data = (self.base.path / entry.file).read_bytes()
         self.exported.append(Exported(name, data, entry.precision, entry.parameters))
         self.scores[name] = manifest.scores.get(name, {})
-        self.provenance[name] = {
-            "taken_from": f"{manifest.name} {manifest.version}",
-            "data": manifest.training.get("data"),
-            **manifest.training.get("networks", {}).get(name, {}),
-        }
+        self.provenance[name] = training_of(manifest, name)
         return self.base.networks[name]
 
     def _measured(self, name: str, measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:

@@ -38,8 +38,6 @@ DOUBT = 2.0
 HUBER_SIGMAS = 1.0
 """``LiftSettings.huber_sigmas`` of a pipeline: a network's outline of a vehicle that is partly hidden is a guess, and wrong
 guesses are far off (validation scenes; docs: lifting)."""
-
-
 _WARM_UP_CROPS = 64
 """Vehicles in four cameras' views of a busy crossing."""
 

@@ -23,7 +23,7 @@ from models_export.train.config import nested_tuples
 from models_export.train.task import Batch, Task
 from service.errors import InputError
 from service.geometry.transforms import Array
-from service.nets.pack import METADATA_KEY, read_manifest
+from service.nets.pack import METADATA_KEY, Manifest, read_manifest
 
 SUFFIX = ".onnx"
 _CALIBRATION_ITEMS = 64
@@ -54,18 +54,21 @@ def load_exported(task: Task, path: Path) -> None:
 
 def provenance(path: Path) -> dict[str, Any] | None:
     """What the manifest beside a pack's network says of its training; None without one. Raises PackError for a bad one."""
-    manifest = path.parent / "manifest.json"
-    if not manifest.is_file():
+    file = path.parent / "manifest.json"
+    if not file.is_file():
         return None
-    pack = read_manifest(manifest)
-    for name, entry in pack.networks.items():
-        if entry.file == path.name:
-            return {
-                "taken_from": f"{pack.name} {pack.version}",
-                "data": pack.training.get("data"),
-                **pack.training.get("networks", {}).get(name, {}),
-            }
-    return None
+    manifest = read_manifest(file)
+    names = [name for name, entry in manifest.networks.items() if entry.file == path.name]
+    return training_of(manifest, names[0]) if names else None
+
+
+def training_of(manifest: Manifest, name: str) -> dict[str, Any]:
+    """How a pack's network came about, for the manifest of another pack that goes on from it or takes it over."""
+    return {
+        "taken_from": f"{manifest.name} {manifest.version}",
+        "data": manifest.training.get("data"),
+        **manifest.training.get("networks", {}).get(name, {}),
+    }
 
 
 def _read(path: Path) -> onnx.ModelProto:
