@@ -28,6 +28,7 @@ from service.nets.depth import InverseDepth
 from service.nets.detections import Detections
 from service.nets.guided import GuidedDetector, guide_maps, metric_map
 from service.nets.pack import Pack
+from service.site import Site
 
 logger = logging.getLogger(__name__)
 
@@ -54,10 +55,6 @@ class GuidanceSettings:
     """Largest squared Mahalanobis distance at which a guided box is a lifted one's: 99 % of two degrees of freedom."""
     max_distance_m: float = 3.0
     """Boxes farther apart are two vehicles, metres."""
-    ground_sigma_m: float = 0.05
-    """How far a wheel may stand above or below the ground, metres (one sigma); as for lifted boxes."""
-    ground_sigma_per_m: float = 0.003
-    """What a metre of distance adds to it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +112,7 @@ class Guidance:
         self,
         views: Sequence[View],
         hard: NDArray[np.bool_],
-        ground: Ground,
+        site: Site,
         lifted: Boxes,
         camera_index: Index,
         method: Method,
@@ -127,7 +124,7 @@ class Guidance:
         if not hard.any():
             return lifted, camera_index
         chosen = [int(number) for number in np.flatnonzero(hard)]
-        guided = self._boxes([views[c] for c in chosen], ground, method)
+        guided = self._boxes([views[c] for c in chosen], site, method)
         settings = self.settings
         parts, owners = [lifted.take(~hard[camera_index])], [camera_index[~hard[camera_index]]]
         for number, own in zip(chosen, guided, strict=True):
@@ -151,19 +148,19 @@ class Guidance:
         size = self.detector.spec.fit.size
         return None if size is None else size[0]
 
-    def _boxes(self, views: Sequence[View], ground: Ground, method: Method) -> list[Boxes]:
-        settings = self.settings
+    def _boxes(self, views: Sequence[View], site: Site, method: Method) -> list[Boxes]:
+        settings, told = self.settings, site.accuracy
         whole = self.max_width is not None
         images = [view.still.whole if whole else view.still.small for view in views]
         cameras = [view.still.whole_camera if whole else view.still.small_camera for view in views]
         focal = [float(camera.K[1, 1]) for camera in cameras]
-        maps = [self._maps(view, camera, ground) for view, camera in zip(views, cameras, strict=True)]
+        maps = [self._maps(view, camera, site.ground) for view, camera in zip(views, cameras, strict=True)]
         found = self.detector.detect(images, maps, focal, score_threshold=settings.score_threshold, nms_iou=settings.nms_iou)
         boxes = []
         for camera, detections in zip(cameras, found, strict=True):
             own = world_boxes(camera, detections, self._classes[detections.cls])
             if method != "paper":
-                own = on_the_road(own, ground, camera, settings.ground_sigma_m, settings.ground_sigma_per_m)
+                own = on_the_road(own, site.ground, camera, told.ground_m, told.ground_per_m)
             boxes.append(suppress_bev(own, settings.duplicate_iou, settings.duplicate_distance_m))
         return boxes
 

@@ -32,12 +32,15 @@ from service.paper_fusion import PaperFusionSettings, fuse_paper
 from service.residuals import BoxProblem
 from service.sightings import Sightings
 from service.site import Site
+from service.solver import SolverSettings
 
 DOUBT = 2.0
 """``FusionSettings.doubt`` of a pipeline, chosen on validation scenes (docs: fusion)."""
 HUBER_SIGMAS = 1.0
 """``LiftSettings.huber_sigmas`` of a pipeline: a network's outline of a vehicle that is partly hidden is a guess, and wrong
 guesses are far off (validation scenes; docs: lifting)."""
+SOLVER = SolverSettings(step_tolerance=1.0)
+"""Of a pipeline's lifting and fusion: with networks' outlines, steps shorter than a sigma change no AP (docs: fusion)."""
 _WARM_UP_CROPS = 64
 """Vehicles in four cameras' views of a busy crossing."""
 
@@ -63,10 +66,10 @@ class PipelineSettings:
     """Fused boxes whose place on the road is less certain (one sigma, both axes together) are dropped: mostly vehicles that one
     camera alone sees, from far away, often beside their own box from the other cameras. ``per_camera`` has them. The paper's
     method knows no such limit."""
-    lift: LiftSettings = field(default_factory=lambda: LiftSettings(huber_sigmas=HUBER_SIGMAS))
+    lift: LiftSettings = field(default_factory=lambda: LiftSettings(huber_sigmas=HUBER_SIGMAS, solver=SOLVER))
     """How exact the ground is, and for fusion the cameras, a site's own ``accuracy`` says."""
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
-    fusion: FusionSettings = field(default_factory=lambda: FusionSettings(doubt=DOUBT))
+    fusion: FusionSettings = field(default_factory=lambda: FusionSettings(doubt=DOUBT, solver=SOLVER))
     paper_fusion: PaperFusionSettings = field(default_factory=PaperFusionSettings)
 
 
@@ -223,7 +226,7 @@ class Pipeline:
         rows = zip(stills, found, maps, strict=True)
         views = [View(still, own, *depth) for still, own, depth in rows]
         hard = guidance.hard_views(views)
-        lifted, index = guidance.add(views, hard, site.ground, lifted, index, self.settings.method)
+        lifted, index = guidance.add(views, hard, site, lifted, index, self.settings.method)
         return lifted, index, frozenset(still.camera.id for still, is_hard in zip(stills, hard, strict=True) if is_hard)
 
     def _fuse(self, seen: Sightings, site: Site) -> FusedBoxes:

@@ -27,7 +27,7 @@ from service.nets.depth import DepthNet
 from service.nets.guided import GuidedDetector
 from service.nets.pack import load_pack, open_network
 from service.pipeline import Pipeline, PipelineSettings
-from service.site import parse_site
+from service.site import AccuracyModel, parse_site
 
 CLIP = Path(__file__).resolve().parents[2] / "clients" / "clip"
 SMALL = GuidedConfig(channels=(8, 8, 16, 16, 16), neck=16)
@@ -96,6 +96,18 @@ def test_always_adds_boxes_and_never_changes_none(pack_folder: Path, method: str
         if method == "map":
             assert len(own) >= len(before)
     assert sum(guided.detections.values()) == sum(len(own) for own in guided.per_camera)
+
+
+def test_guided_boxes_stand_as_exactly_on_the_road_as_the_site_says(pack_folder: Path) -> None:
+    pipeline = Pipeline(load_pack(str(pack_folder)), PipelineSettings(hard_mode="always"))
+    exact, vague = frame_set(), frame_set()
+    vague = replace(vague, site=replace(vague.site, accuracy=AccuracyModel(ground_m=2.0)))
+    exact = replace(exact, site=replace(exact.site, accuracy=AccuracyModel(ground_m=0.01, ground_per_m=0.0)))
+    heights = [
+        np.median(np.concatenate([np.sqrt(own.covariance[:, 2, 2]) for own in pipeline.run(frames).per_camera]))
+        for frames in (exact, vague)
+    ]
+    assert heights[0] < 0.5 * heights[1]
 
 
 def test_always_without_the_network_is_refused() -> None:
