@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import resource
 import signal
 import sys
 import tempfile
@@ -26,6 +27,9 @@ from clients.local_service import LocalServiceError, child_environment
 SCHEMATHESIS = "from schemathesis.cli import schemathesis; schemathesis()"
 _SLACK_S = 45.0
 """For an attack to end beside its time: schemathesis reads the description first and reports last."""
+ATTACKER_NICE = 19
+"""Of an attacker's processes. It stands for another machine: here it may use what the service and its honest client leave, and
+is not to take their processor, which no service can guard. What it used is printed beside its pace."""
 _WARM_UP_S = 2.0
 _SHOWN = 1500
 
@@ -80,6 +84,7 @@ async def _run(command: list[str], folder: Path, seconds: float) -> tuple[int | 
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.STDOUT,
     )
+    os.setpriority(os.PRIO_PROCESS, child.pid, ATTACKER_NICE)
     try:
         async with asyncio.timeout(seconds + _SLACK_S):
             said, _ = await child.communicate()
@@ -90,6 +95,12 @@ async def _run(command: list[str], folder: Path, seconds: float) -> tuple[int | 
         if child.returncode is None:
             os.killpg(child.pid, signal.SIGKILL)
             await child.wait()
+
+
+def _ended_children_cpu_s() -> float:
+    """Processor time of child processes that have ended: between two calls, the attackers'; the service goes on running."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 ATTACKS: dict[str, Attack] = {
@@ -117,9 +128,9 @@ async def _run_one(attack: Attack, seconds: float, seed: int) -> dict[str, Any]:
         await honest.during(partial(asyncio.sleep, _WARM_UP_S))
         _, before = await honest.during(partial(asyncio.sleep, seconds))
         then = await asyncio.to_thread(read_counters, target.url)
-        began = time.monotonic()
+        began, began_cpu_s = time.monotonic(), _ended_children_cpu_s()
         own, during = await honest.during(lambda: attack(target, clip, seconds, seed))
-        took_s = time.monotonic() - began
+        took_s, cpu_s = time.monotonic() - began, _ended_children_cpu_s() - began_cpu_s
         now = await asyncio.to_thread(read_counters, target.url)
         alive = target.process.poll() is None
     answered = {status: n - then.by_label("http_requests", "status").get(status, 0)
@@ -129,6 +140,7 @@ async def _run_one(attack: Attack, seconds: float, seed: int) -> dict[str, Any]:
     failed_attack = sum(failed.values()) - sum(n for status, n in during.failures.items() if status in failed)
     figures = own | compare(before, during) | {
         "seconds": round(took_s, 1),
+        "attacker_cores": round(cpu_s / took_s, 3),
         "http_answers": sum(answered.values()) - during.requests,
         "answers_by_status": {status: count for status, count in sorted(answered.items()) if count},
         "5xx": max(failed_attack, own.get("5xx", 0)),
