@@ -63,6 +63,10 @@ class AugmentConfig:
     """Most of them."""
     max_covered: float = 0.6
     """A vehicle of which more is cut out is neither positive nor negative."""
+    hidden: float = 0.0
+    """Probability that another vehicle hides a part: of crops of single vehicles only."""
+    hidden_reach: tuple[float, float] = (0.1, 0.45)
+    """How far it reaches into the crop over the crop's side."""
 
 
 NO_AUGMENT = AugmentConfig(
@@ -153,6 +157,21 @@ def cut_out(image: Image, xyxy_px: Array, rng: np.random.Generator, config: Augm
         sides = np.minimum(xyxy_px[:, 2:], [x1, y1]) - np.maximum(xyxy_px[:, :2], [x0, y0])
         fraction += np.prod(np.maximum(sides, 0), axis=1) / area
     return covered, np.minimum(fraction, 1.0)
+
+
+def hidden_behind(crop: Image, other: Image, rng: np.random.Generator, config: AugmentConfig) -> Image:
+    """A square crop (S, S, 3) with a part of another over its left or right side or its bottom: a neighbour in a row."""
+    side = len(crop)
+    reach = max(1, round(side * rng.uniform(*config.hidden_reach)))
+    along = round(side * rng.uniform(0.4, 1.0))
+    # Left and right of the crop the other stands on the same ground, below it anywhere.
+    across = (slice(side - along, side), int(rng.choice([0, side - reach])), reach)
+    below = (slice(side - reach, side), int(rng.integers(0, side - along, endpoint=True)), along)
+    rows, left, width = across if rng.random() < 2 / 3 else below
+    start = int(rng.integers(0, side - width, endpoint=True))
+    covered = crop.copy()
+    covered[rows, left : left + width] = other[rows, start : start + width]
+    return covered
 
 
 def flip_horizontally(image: Image, xyxy_px: Array, width: int) -> tuple[Image, Array]:

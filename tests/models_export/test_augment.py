@@ -15,6 +15,7 @@ from models_export.data.augment import (
     cut_out,
     darkened,
     flip_horizontally,
+    hidden_behind,
     photometric,
     place,
     rescale,
@@ -77,6 +78,20 @@ def test_cut_outs_say_how_much_they_cover() -> None:
         changed = np.any(covered != 77, axis=2).mean()
         if changed:  # a patch may have the picture's own colour
             assert fraction[0] == pytest.approx(changed, abs=0.03)
+
+
+@given(st.integers(0, 10_000))
+def test_another_vehicle_hides_one_side_and_no_more_than_it_may(seed: int) -> None:
+    crop, other = np.full((96, 96, 3), 10, np.uint8), np.full((96, 96, 3), 200, np.uint8)
+    config = replace(AugmentConfig(), hidden_reach=(0.1, 0.45))
+    hidden = hidden_behind(crop, other, np.random.default_rng(seed), config)[..., 0] == 200
+    assert (crop == 10).all()
+    rows, columns = np.flatnonzero(hidden.any(1)), np.flatnonzero(hidden.any(0))
+    assert hidden.sum() == len(rows) * len(columns)
+    assert rows[-1] == 95
+    across = len(columns) <= 44 and {columns[0], columns[-1]} & {0, 95}
+    assert across or len(rows) <= 44
+    assert min(len(rows), len(columns)) >= 9
 
 
 @given(st.integers(0, 10_000))
