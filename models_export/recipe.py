@@ -14,7 +14,7 @@ from models_export.data.detection import DetectionSample
 from models_export.data.real import RealData
 from models_export.data.samples import Sample, load_samples, split_scenes
 from models_export.guided import GuidedRecipe
-from models_export.train import exported
+from models_export.train import checkpoint, exported
 from models_export.train.checkpoint import load_checkpoint
 from models_export.train.config import TrainConfig, nested_tuples
 from models_export.train.loop import fit
@@ -118,9 +118,9 @@ def train(
 ) -> nn.Module:
     """Train one network on the training scenes of ``data``; checkpoint, logs and curves go to ``out``.
 
-    real: recordings, for the networks that learn from them too. init: a file or folder of weights to start from, or a pack's
-    ONNX file of this network; when resuming, only the latter is read. Raises InputError for an unknown network, too little
-    data, and weights that do not fit, NotFoundError for recordings that are not there.
+    real: recordings, for the networks that learn from them too. init: a file or folder of weights to start from, an earlier
+    run's checkpoint or a pack's ONNX file of this network; when resuming, only the latter two are read. Raises InputError for
+    an unknown network, too little data, and weights that do not fit, NotFoundError for recordings that are not there.
     """
     network = recipe.network(name)
     training, held_out = (recipe.samples(scenes) for scenes in split_scenes(data))
@@ -134,6 +134,8 @@ def train(
         # When resuming, too: the priors that its weights are bound to are part of the run.
         exported.load_exported(task, init)
         before = exported.provenance(init)
+    elif init is not None and init.suffix == checkpoint.SUFFIX:
+        before = checkpoint.go_on_from(task, init)
     elif init is not None and not resume:
         network.load_pretrained(task.net, init)
     config = replace(

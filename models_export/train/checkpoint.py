@@ -10,6 +10,8 @@ from typing import Any
 import torch
 from torch import nn
 
+from models_export.train.config import with_priors
+from models_export.train.task import Task
 from service.errors import InputError
 
 SUFFIX = ".pt"
@@ -58,6 +60,17 @@ def load_checkpoint(net: nn.Module, path: Path) -> None:
             f"holds no weights of this network: {error}", field=str(path), remedy="Give its checkpoint."
         ) from error
     net.train()
+
+
+def go_on_from(task: Task, path: Path) -> dict[str, Any]:
+    """Start a task from an earlier run's averaged weights, with the priors (anchors, mean sizes) that they are bound to.
+
+    Returns how they came about, for the record. Raises InputError when they do not fit.
+    """
+    load_checkpoint(task.net, path)
+    state = read_checkpoint(path)
+    task.config = task.net.config = with_priors(task.config, state["task"]["net"])
+    return {"taken_from": path.name, "training": state["config"], "task": state["task"], "steps": state["step"]}
 
 
 def checkpoint_or(read: Callable[[Any, Path], object]) -> Callable[[Any, Path], None]:

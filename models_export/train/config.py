@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, get_args
 
 from service.errors import InputError
@@ -13,6 +13,7 @@ Optimizer = Literal["adamw", "adam", "sgd"]
 Schedule = Literal["cosine", "multistep"]
 AmpType = Literal["bfloat16", "float16"]
 
+_PRIORS = ("anchors_px", "mean_dims_lwh")
 _FREE_ON_RESUME = ("max_minutes", "anneal_in_time", "checkpoint_every", "device", "threads", "workers")
 
 
@@ -109,6 +110,12 @@ class TrainConfig:
 def nested_tuples(rows: Any) -> Any:
     """Lists of lists, as JSON and checkpoints hold them, as the tuples of a frozen configuration."""
     return tuple(nested_tuples(row) for row in rows) if isinstance(rows, list | tuple) else rows
+
+
+def with_priors(config: Any, values: Mapping[str, Any]) -> Any:
+    """A network's configuration with the priors among ``values``: what training data decide, and weights are bound to."""
+    known = {field.name for field in fields(config)}
+    return replace(config, **{name: nested_tuples(values[name]) for name in _PRIORS if name in known and name in values})
 
 
 def decisive(config: Mapping[str, Any]) -> dict[str, Any]:

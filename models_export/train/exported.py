@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from google.protobuf.message import DecodeError
 from onnx import numpy_helper
 from torch import Tensor, nn
 
-from models_export.train.config import nested_tuples
+from models_export.train.config import with_priors
 from models_export.train.task import Batch, Task
 from service.errors import InputError
 from service.geometry.transforms import Array
@@ -27,8 +26,6 @@ from service.nets.pack import METADATA_KEY, Manifest, read_manifest
 
 SUFFIX = ".onnx"
 _CALIBRATION_ITEMS = 64
-_PRIORS = ("anchors_px", "mean_dims_lwh")
-"""Of a configuration: what training data decide and weights are bound to. They are the file's."""
 _FRESH_GAIN = 0.2
 """Of the norm behind a convolution that starts anew: its block is felt, and what follows still understands its input."""
 
@@ -86,8 +83,7 @@ def _with_priors(config: Any, model: onnx.ModelProto) -> Any:
     for entry in model.metadata_props:
         if entry.key == METADATA_KEY:
             metadata = json.loads(entry.value)
-    known = {field.name for field in fields(config)}
-    return replace(config, **{name: nested_tuples(metadata[name]) for name in _PRIORS if name in known and name in metadata})
+    return with_priors(config, metadata)
 
 
 def _values(graph: onnx.GraphProto) -> dict[str, Array]:

@@ -17,7 +17,7 @@ from models_export.nets.depth import DepthConfig
 from models_export.nets.detector import DetectorConfig
 from models_export.nets.multibin import MultibinConfig
 from models_export.train.batches import batches
-from models_export.train.checkpoint import load_averaged, read_checkpoint
+from models_export.train.checkpoint import go_on_from, load_averaged, read_checkpoint
 from models_export.train.config import Optimizer, TrainConfig
 from models_export.train.depth import DepthTask
 from models_export.train.detector import DetectorTask
@@ -96,6 +96,19 @@ def test_a_checkpoint_holds_its_configuration(toy_samples: list[Sample], tmp_pat
     loaded, state = load_averaged(tmp_path / "detector.pt", task_of("detector", toy_samples).net)
     assert state["task"]["net"]["channels"] == SMALL_DETECTOR.channels
     for ours, theirs in zip(loaded.state_dict().values(), trained.state_dict().values(), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_another_run_goes_on_with_the_priors_that_the_weights_are_bound_to(toy_samples: list[Sample], tmp_path: Path) -> None:
+    earlier = task_of("multibin", toy_samples)
+    trained = fit(earlier, replace(SHORT, steps=2), tmp_path)
+    longer = [replace(sample, dims_lwh=1.1 * sample.dims_lwh) for sample in toy_samples]
+    task = task_of("multibin", longer)
+    assert task.config.mean_dims_lwh != earlier.config.mean_dims_lwh
+    before = go_on_from(task, tmp_path / "multibin.pt")
+    assert task.config.mean_dims_lwh == task.net.config.mean_dims_lwh == earlier.config.mean_dims_lwh
+    assert (before["taken_from"], before["steps"]) == ("multibin.pt", 2)
+    for ours, theirs in zip(task.net.parameters(), trained.parameters(), strict=True):
         assert torch.equal(ours, theirs)
 
 
