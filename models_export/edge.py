@@ -24,7 +24,7 @@ def edge_recipe(
     """The pack as it is shipped, or with networks of other shapes."""
     return PackRecipe(
         name="edge",
-        version="4",
+        version="5",
         networks=(
             _detector(detector or DetectorConfig()),
             _multibin(multibin or MultibinConfig()),
