@@ -49,7 +49,7 @@ class GuidedRecipe:
     """Gamma 2, for no anchors are left out of the background here, and most are easy."""
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     noise: GuideNoise = field(default_factory=GuideNoise)
-    load_pretrained: Callable[[Any, Path], None] = load_checkpoint
+    load_pretrained: Callable[[Any, Path], object] = load_checkpoint
     """Puts the weights of a user's file into the network."""
     training: TrainConfig = field(
         default_factory=lambda: TrainConfig(steps=4000, batch_size=8, learning_rate=6e-3, ema_decay=0.995, amp=False)

@@ -59,7 +59,7 @@ def _detector(config: Yolov3Config) -> NetworkRecipe:
         training=TrainConfig(steps=20_000, batch_size=16, learning_rate=1e-3, weight_decay=5e-4, clip_norm=10.0),
         outputs=config.outputs,
         metadata=yolov3_metadata,
-        load_pretrained=checkpoint_or(read_backbone),
+        load_pretrained=read_backbone,
     )
 
 
@@ -76,7 +76,7 @@ def _multibin(config: VggMultibinConfig) -> NetworkRecipe:
         outputs=("vectors", "confidence", "residual"),
         metadata=multibin_metadata,
         canvas_hw=(config.crop_px, config.crop_px),
-        load_pretrained=checkpoint_or(VggMultibin.load_imagenet),
+        load_pretrained=VggMultibin.load_imagenet,
     )
 
 
@@ -93,7 +93,7 @@ def _depth(config: DptConfig, canvas_hw: tuple[int, int]) -> NetworkRecipe:
         outputs=("inverse_depth",),
         metadata=depth_metadata,
         canvas_hw=canvas_hw,
-        load_pretrained=checkpoint_or(DptHybrid.load_pretrained),
+        load_pretrained=DptHybrid.load_pretrained,
         for_export=DptHybrid.with_folded_weights,
     )
 

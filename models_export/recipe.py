@@ -62,7 +62,7 @@ class NetworkRecipe:
     """Height and width of the only input that it takes, px: frames are scaled to fit. None: any multiple of 32 px."""
     precision: Precision = "fp32"
     """In which it is exported unless asked otherwise."""
-    load_pretrained: Callable[[Any, Path], None] = load_checkpoint
+    load_pretrained: Callable[[Any, Path], object] = load_checkpoint
     """Puts the weights of a user's file or folder into the network: what ``--init`` names."""
     real: Callable[[RealData, tuple[str, ...], int], tuple[Sequence[DetectionSample], Sequence[DetectionSample]]] = no_samples
     """What recordings add to the training and to the held-out samples, for given classes and width of images, px."""

@@ -84,8 +84,8 @@ async def _run(command: list[str], folder: Path, seconds: float) -> tuple[int | 
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.STDOUT,
     )
-    os.setpriority(os.PRIO_PROCESS, child.pid, ATTACKER_NICE)
     try:
+        os.setpriority(os.PRIO_PROCESS, child.pid, ATTACKER_NICE)
         async with asyncio.timeout(seconds + _SLACK_S):
             said, _ = await child.communicate()
         return child.returncode, said.decode("utf-8", "replace").strip()

@@ -51,15 +51,19 @@ def load_averaged(checkpoint: Path, net: nn.Module) -> tuple[nn.Module, dict[str
     return net.eval(), state
 
 
-def load_checkpoint(net: nn.Module, path: Path) -> None:
-    """Start from the averaged weights of an earlier run's checkpoint. Raises InputError when they do not fit."""
+def load_checkpoint(net: nn.Module, path: Path) -> dict[str, Any]:
+    """Start from the averaged weights of an earlier run's checkpoint; gives its description.
+
+    Raises InputError when they do not fit.
+    """
     try:
-        load_averaged(path, net)
+        _, state = load_averaged(path, net)
     except (RuntimeError, KeyError) as error:
         raise InputError(
             f"holds no weights of this network: {error}", field=str(path), remedy="Give its checkpoint."
         ) from error
     net.train()
+    return state
 
 
 def go_on_from(task: Task, path: Path) -> dict[str, Any]:
@@ -67,8 +71,7 @@ def go_on_from(task: Task, path: Path) -> dict[str, Any]:
 
     Returns how they came about, for the record. Raises InputError when they do not fit.
     """
-    load_checkpoint(task.net, path)
-    state = read_checkpoint(path)
+    state = load_checkpoint(task.net, path)
     task.config = task.net.config = with_priors(task.config, state["task"]["net"])
     return {"taken_from": path.name, "training": state["config"], "task": state["task"], "steps": state["step"]}
 

@@ -7,7 +7,6 @@ data: it gets them from one batch, and the scale and shift under which it gives 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +43,7 @@ def load_exported(task: Task, path: Path) -> None:
         raise InputError(
             f"holds no weights of this network: {error}", field=str(path), remedy="Give the file of its role in a pack."
         ) from error
-    task.config = task.net.config = _with_priors(task.config, model)
+    task.config = task.net.config = with_priors(task.config, _metadata(model))
     indices = np.linspace(0, len(task) - 1, min(len(task), _CALIBRATION_ITEMS)).astype(np.int64)
     _unfold(task, folded, task.batch(indices, np.random.default_rng(0)))
 
@@ -77,13 +76,13 @@ def _read(path: Path) -> onnx.ModelProto:
         raise InputError(f"is not ONNX: {error}", field=str(path), remedy="Give a network of a pack.") from error
 
 
-def _with_priors(config: Any, model: onnx.ModelProto) -> Any:
-    """The configuration with the priors that stand in the file's metadata."""
-    metadata: Mapping[str, Any] = {}
+def _metadata(model: onnx.ModelProto) -> dict[str, Any]:
+    """What an exported file says of itself; nothing where it is not ours."""
     for entry in model.metadata_props:
         if entry.key == METADATA_KEY:
-            metadata = json.loads(entry.value)
-    return with_priors(config, metadata)
+            metadata: dict[str, Any] = json.loads(entry.value)
+            return metadata
+    return {}
 
 
 def _values(graph: onnx.GraphProto) -> dict[str, Array]:

@@ -182,14 +182,14 @@ def client(start: Callable[..., ServiceClient]) -> ServiceClient:
     return start()
 
 
-def open_and_never_read(address: str) -> socket.socket:
-    """A subscriber with small buffers that takes no byte after the handshake."""
+def open_and_never_read(address: str, path: str = "/stream/demo") -> socket.socket:
+    """A WebSocket peer, by default a subscriber, with small buffers that takes no byte after the handshake."""
     host, port = address.split(":")
     raw = socket.socket()
     raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     raw.connect((host, int(port)))
     raw.sendall(
-        f"GET /stream/demo HTTP/1.1\r\nHost: {address}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        f"GET {path} HTTP/1.1\r\nHost: {address}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
         "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
     )
     assert b"101" in raw.recv(16)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import struct
 import threading
 import time
@@ -159,17 +158,12 @@ def test_a_sender_of_nothing_but_errors_is_cut(start: Callable[..., Any]) -> Non
     assert drops(client) == {"frame_refused": 3}
 
 
-def test_a_sender_that_was_cut_and_sends_on_is_not_read_any_more(start: Callable[..., Any]) -> None:
+def test_a_sender_that_was_cut_and_sends_on_is_not_read_any_more(start: Callable[..., Any], tools: Any) -> None:
     """It reads nothing, and so does not learn that it should go: its connection fills up until it is broken off."""
     client = start(ingest_max_errors=1)
-    host, port = client.address.split(":")
     small_text = b"\x81\x81\0\0\0\0x"
-    with socket.create_connection((host, int(port)), timeout=1.0) as stranger:
-        stranger.sendall(
-            f"GET /ingest/demo HTTP/1.1\r\nHost: {client.address}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-            "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
-        )
-        assert b"101" in stranger.recv(16)
+    with tools.open_and_never_read(client.address, "/ingest/demo") as stranger:
+        stranger.settimeout(1.0)
         with pytest.raises(TimeoutError):
             stranger.sendall(10_000_000 * small_text)
         assert client.get("/health/live").status_code == 200
