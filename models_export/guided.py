@@ -16,7 +16,7 @@ from torch.export import Dim
 
 from models_export.data.augment import AugmentConfig
 from models_export.data.guided_frames import GuidedFrame, GuideNoise, Map, frame_maps, guided_frames
-from models_export.data.samples import Sample, load_samples, split_scenes
+from models_export.data.samples import Sample, read_samples, split_scenes
 from models_export.export import MAX_TILES, Exported, trace, with_metadata, write_pack
 from models_export.guided_losses import GuidedLossConfig
 from models_export.guided_scores import measure
@@ -77,7 +77,7 @@ def train_guided(
 
 
 def _frames(scenes: Sequence[Path], depth: DepthNet, recipe: GuidedRecipe) -> tuple[list[Sample], list[GuidedFrame]]:
-    samples = load_samples(scenes, recipe.net.classes, recipe.net.max_width, recipe.net.guide_stride)
+    samples = list(read_samples(scenes, recipe.net.classes, recipe.net.max_width, recipe.net.guide_stride))
     return samples, guided_frames(samples, depth)
 
 

@@ -93,11 +93,11 @@ def export(
     if validation:
         training, held_out = training + held_out, [scene for root in validation for scene in list_scenes(root)]
     some = training[:: max(len(training) // _CALIBRATION_SCENES, 1)][:_CALIBRATION_SCENES]
-    calibration = recipe.samples(some)
+    calibration = list(recipe.samples(some))
     calibration = calibration[:: max(len(calibration) // _CALIBRATION_IMAGES, 1)]
     options = options or ExportOptions()
     base = None if options.base is None else load_pack(options.base, provider="cpu")
-    job = _Job(recipe, runs, options, recipe.samples(held_out), calibration, base)
+    job = _Job(recipe, runs, options, list(recipe.samples(held_out)), calibration, base)
     detections = job.detector()
     job.multibin(detections)
     job.depth(detections)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -12,7 +13,7 @@ from torch import nn
 
 from models_export.data.detection import DetectionSample
 from models_export.data.real import RealData
-from models_export.data.samples import Sample, load_samples, split_scenes
+from models_export.data.samples import Sample, read_samples, split_scenes
 from models_export.guided import GuidedRecipe
 from models_export.train import checkpoint, exported
 from models_export.train.checkpoint import load_checkpoint
@@ -27,7 +28,7 @@ Precision = Literal["fp32", "fp16", "int8"]
 class SampleTask(Task, Protocol):
     """A task over samples of scenes, and of real recordings where the network's recipe takes them."""
 
-    def held_out(self, samples: Sequence[Any]) -> Task:
+    def held_out(self, samples: Iterable[Any]) -> Task:
         """The same network and configuration over other samples, which are not augmented: for validation."""
 
 
@@ -51,7 +52,7 @@ class NetworkRecipe:
     """Frozen dataclass of the network's shape. The task replaces what the data decide: anchors, mean sizes."""
     build: Callable[[Any], nn.Module]
     """The network of a configuration."""
-    task: Callable[[Sequence[Any], Any], SampleTask]
+    task: Callable[[Iterable[Any], Any], SampleTask]
     """The task of training samples and a configuration."""
     training: TrainConfig
     outputs: tuple[str, ...]
@@ -100,10 +101,10 @@ class PackRecipe:
         changed = replace(self.network(name), training=training)
         return replace(self, networks=tuple(changed if n.name == name else n for n in self.networks))
 
-    def samples(self, scenes: Sequence[Path]) -> list[Sample]:
-        """Frames of scenes, as the detector and the depth net take them."""
+    def samples(self, scenes: Iterable[Path]) -> Iterator[Sample]:
+        """Frames of scenes, as the detector and the depth net take them, read as they are taken."""
         detector, depth = self.network("detector").config, self.network("depth").config
-        return load_samples(scenes, detector.classes, detector.max_width, depth.stride)
+        return read_samples(scenes, detector.classes, detector.max_width, depth.stride)
 
 
 def train(
@@ -128,7 +129,7 @@ def train(
     added, checked = network.real(real, detector.classes, detector.max_width) if real else ([], [])
     # Before the network is made: its first weights are drawn.
     torch.manual_seed(network.training.seed)
-    task = network.task([*training, *added], network.config)
+    task = network.task(chain(training, added), network.config)
     before = None
     if init is not None and init.suffix == exported.SUFFIX:
         # When resuming, too: the priors that its weights are bound to are part of the run.
@@ -144,7 +145,7 @@ def train(
         before=before,
         recordings=real.credits() if real and added else (),
     )
-    return fit(task, config, out, task.held_out([*held_out, *checked]), resume=resume)
+    return fit(task, config, out, task.held_out(chain(held_out, checked)), resume=resume)
 
 
 def resolved_config(network: NetworkRecipe, saved: Mapping[str, Any]) -> Any:

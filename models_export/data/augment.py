@@ -28,6 +28,10 @@ class AugmentConfig:
     """Largest translation over the image's size."""
     geometric: float = 0.7
     """Probability of scaling and shifting."""
+    tiles: float = 0.3
+    """Probability that a canvas holds four times as many pictures, each reduced: of detectors' canvases only."""
+    tile_scale: tuple[float, float] = (0.45, 0.9)
+    """Least and largest factor of those."""
     flip: float = 0.5
     brightness: float = 40.0
     """Largest offset, grey levels."""
@@ -70,7 +74,7 @@ class AugmentConfig:
 
 
 NO_AUGMENT = AugmentConfig(
-    scale=(1.0, 1.0), shift=0.0, geometric=0.0, flip=0.0, brightness=0.0, contrast=(1.0, 1.0), saturation=(1.0, 1.0),
+    scale=(1.0, 1.0), shift=0.0, geometric=0.0, tiles=0.0, flip=0.0, brightness=0.0, contrast=(1.0, 1.0), saturation=(1.0, 1.0),
     white_balance=0.0, blur=0.0, noise=0.0, jpeg=0.0, motion_blur=0.0, night=0.0, fog=0.0, cut_out=0.0,
 )  # fmt: skip
 """Images as they are: for validation."""
@@ -202,6 +206,16 @@ def place(image: Image, xyxy_px: Array, size: tuple[int, int], rng: np.random.Ge
         return image, xyxy_px
     spare = np.maximum(np.array(image.shape[1::-1]) - size, 0)
     return _moved(image, xyxy_px, size, 1.0, -rng.integers(0, spare, endpoint=True).astype(np.float64))
+
+
+def shrink(
+    image: Image, xyxy_px: Array, size: tuple[int, int], rng: np.random.Generator, config: AugmentConfig
+) -> tuple[Image, Array]:
+    """A random part of an image and its boxes, made smaller, on a canvas of ``size`` (width, height): grey only where the
+    whole image does not fill it."""
+    scale = float(np.exp(rng.uniform(*np.log(config.tile_scale))))
+    spare = np.array(size) - scale * np.array(image.shape[1::-1])
+    return _moved(image, xyxy_px, size, scale, rng.uniform(np.minimum(spare, 0.0), np.maximum(spare, 0.0)))
 
 
 def _moved(image: Image, xyxy_px: Array, size: tuple[int, int], scale: float, offset: Array) -> tuple[Image, Array]:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from models_export.data.ahead import mapped_ahead
 from models_export.data.dataset import UNKNOWN_CONDITION, Scene, SceneTruth, list_scenes, open_scene
 from models_export.data.detection import MIN_SIDE_PX, VEHICLES, Still, VehicleSample, class_columns
 from service.errors import InputError
@@ -69,12 +70,10 @@ def split_scenes(roots: Iterable[Path]) -> tuple[list[Path], list[Path]]:
     return training, validation
 
 
-def load_samples(scenes: Iterable[Path], classes: tuple[str, ...], max_width: int, depth_stride: int) -> list[Sample]:
-    """All frames of all cameras of scenes, in memory. classes: lower-case names, in the network's order."""
-    # Decoders let go of the interpreter's lock.
-    with ThreadPoolExecutor() as pool:
-        parts = pool.map(lambda path: _load_scene(open_scene(path), classes, max_width, depth_stride), scenes)
-        return [sample for part in parts for sample in part]
+def read_samples(scenes: Iterable[Path], classes: tuple[str, ...], max_width: int, depth_stride: int) -> Iterator[Sample]:
+    """All frames of all cameras of scenes, read as they are taken. classes: lower-case names, in the network's order."""
+    parts = mapped_ahead(lambda path: _load_scene(open_scene(path), classes, max_width, depth_stride), scenes)
+    return chain.from_iterable(parts)
 
 
 def _load_scene(scene: Scene, classes: tuple[str, ...], max_width: int, depth_stride: int) -> list[Sample]:

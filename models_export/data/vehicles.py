@@ -17,7 +17,7 @@ from service.nets.multibin import CONTEXT, crop_vehicles, crop_windows
 
 _ROOM = 1.7
 """Side of the kept picture over that of an exact crop: what jitter of the box may reach."""
-_MAX_PATCH_PX = 224
+_MAX_PATCH_PX = 176
 """Longer sides are reduced: crops are smaller still."""
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -12,6 +10,7 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
+from models_export.data.ahead import mapped_ahead
 from models_export.train.config import TrainConfig
 from models_export.train.task import Batch, Task
 
@@ -26,7 +25,7 @@ def batches(task: Task, config: TrainConfig, start: int) -> Iterator[Batch]:
     """
     assert config.steps is not None, "epochs are resolved before training"
     if config.device == "cpu":
-        yield from _on_threads(task, config, range(start, config.steps))
+        yield from mapped_ahead(lambda step: _batch(task, config, step), range(start, config.steps), config.workers)
         return
     # Before the fork: a child cannot stop the threads of its parent's OpenCV, which it has not got, and would wait for them.
     cv2.setNumThreads(1)
@@ -50,17 +49,6 @@ class _Steps(Dataset[Batch]):
 
     def __getitem__(self, step: int) -> Batch:
         return _batch(self.task, self.config, step)
-
-
-def _on_threads(task: Task, config: TrainConfig, steps: range) -> Iterator[Batch]:
-    with ThreadPoolExecutor(config.workers) as pool:
-        ahead: deque[Future[Batch]] = deque()
-        for step in steps:
-            ahead.append(pool.submit(_batch, task, config, step))
-            if len(ahead) > config.workers:
-                yield ahead.popleft().result()
-        while ahead:
-            yield ahead.popleft().result()
 
 
 def _batch(task: Task, config: TrainConfig, step: int) -> Batch:

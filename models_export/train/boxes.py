@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from copy import copy
 from dataclasses import asdict, replace
 from functools import cached_property
@@ -18,7 +18,7 @@ from models_export.anchors import Clusters, anchors_of
 from models_export.data.augment import NO_AUGMENT, AugmentConfig
 from models_export.data.detection import DetectionSample
 from models_export.data.mix import MixConfig, draw_by_odds, draw_odds
-from models_export.train.detector_pictures import canvas_of, stacked, strips_on
+from models_export.train.detector_pictures import canvas_of, stacked, strips_on, tiled
 from models_export.train.task import Batch, ParameterGroup, decayed_groups
 from service.geometry.transforms import Array
 
@@ -32,7 +32,7 @@ class BoxTask:
 
     def __init__(
         self,
-        samples: Sequence[DetectionSample],
+        samples: Iterable[DetectionSample],
         config: Any,
         build: Callable[[Any], nn.Module],
         clusters: Clusters,
@@ -40,12 +40,12 @@ class BoxTask:
         mix: MixConfig | None,
     ) -> None:
         """Make the network of ``config``, whose anchors become the samples' own, as drawn by ``mix``."""
-        self.samples = samples
+        self.samples = list(samples)
         self.mix = mix or MixConfig()
-        self.odds = draw_odds([sample.source for sample in samples], self.mix)
-        self.canvas_px: tuple[int, int] | None = canvas_of(samples)
+        self.odds = draw_odds([sample.source for sample in self.samples], self.mix)
+        self.canvas_px: tuple[int, int] | None = canvas_of(self.samples)
         drawn = self.draw(np.random.default_rng(0), _ANCHOR_DRAWS)
-        self.config = replace(config, anchors_px=anchors_of([samples[i] for i in drawn], config.strides, clusters))
+        self.config = replace(config, anchors_px=anchors_of([self.samples[i] for i in drawn], config.strides, clusters))
         self.augment = augment or AugmentConfig()
         self.net = build(self.config)
 
@@ -62,11 +62,11 @@ class BoxTask:
     def __len__(self) -> int:
         return len(self.samples)
 
-    def held_out(self, samples: Sequence[DetectionSample]) -> Self:
+    def held_out(self, samples: Iterable[DetectionSample]) -> Self:
         """The same network and configuration over other samples, as they are, each on its own canvas: for validation."""
         other = copy(self)
-        other.samples, other.augment, other.canvas_px = samples, NO_AUGMENT, None
-        other.odds = draw_odds([sample.source for sample in samples], self.mix)
+        other.samples, other.augment, other.canvas_px = list(samples), NO_AUGMENT, None
+        other.odds = draw_odds([sample.source for sample in other.samples], self.mix)
         return other
 
     def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.int64]:
@@ -101,8 +101,10 @@ class BoxTask:
         if self.canvas_px is None:
             return stacked([sample], (sample.canvas.shape[1], sample.canvas.shape[0]), rng, self.augment)
         strips = strips_on(self.canvas_px, sample)
-        others = rng.choice(self._like[_likeness(sample)], size=strips - 1)
-        return stacked([sample, *(self.samples[i] for i in others)], self.canvas_px, rng, self.augment)
+        smaller = rng.random() < self.augment.tiles
+        others = rng.choice(self._like[_likeness(sample)], size=(4 * strips if smaller else strips) - 1)
+        pictures = [sample, *(self.samples[i] for i in others)]
+        return (tiled if smaller else stacked)(pictures, self.canvas_px, rng, self.augment)
 
     @cached_property
     def _like(self) -> dict[tuple[str, int], list[int]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from copy import copy
 from dataclasses import asdict
 from typing import Any
@@ -27,14 +27,15 @@ class DepthTask:
 
     def __init__(
         self,
-        samples: list[Sample],
+        samples: Iterable[Sample],
         config: DepthConfig | DptConfig,
         augment: AugmentConfig | None = None,
         *,
         build: Callable[[Any], nn.Module] = EdgeDepth,
     ) -> None:
         """build: the depth net of a configuration. The samples' inverse depth is at the stride of ``config``."""
-        self.samples, self.like = samples, _by_size(samples)
+        self.samples = list(samples)
+        self.like = _by_size(self.samples)
         self.config = config
         self.augment = augment or AugmentConfig()
         self.net = build(config)
@@ -46,10 +47,11 @@ class DepthTask:
     def __len__(self) -> int:
         return len(self.samples)
 
-    def held_out(self, samples: list[Sample]) -> DepthTask:
+    def held_out(self, samples: Iterable[Sample]) -> DepthTask:
         """The same network and configuration over other samples, which are not augmented: for validation."""
         other = copy(self)
-        other.samples, other.like, other.augment = samples, _by_size(samples), NO_AUGMENT
+        other.samples, other.augment = list(samples), NO_AUGMENT
+        other.like = _by_size(other.samples)
         return other
 
     def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.int64]:

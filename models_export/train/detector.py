@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor, nn
@@ -32,7 +32,7 @@ class DetectorTask(BoxTask):
 
     def __init__(
         self,
-        samples: Sequence[DetectionSample],
+        samples: Iterable[DetectionSample],
         config: DetectorConfig,
         augment: AugmentConfig | None = None,
         mix: MixConfig | None = None,

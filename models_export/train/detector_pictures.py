@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from models_export.data.augment import AugmentConfig, Image, cut_out, flip_horizontally, photometric, place, rescale
+from models_export.data.augment import AugmentConfig, Image, cut_out, flip_horizontally, photometric, place, rescale, shrink
 from models_export.data.detection import MIN_SIDE_PX, DetectionSample
 from service.geometry.transforms import Array
+from service.nets.canvas import PAD_VALUE
 
 UNKNOWN_CLASS = -1
 """Class of a target whose class is not known."""
@@ -33,23 +34,47 @@ def stacked(
     samples: Sequence[DetectionSample], canvas: tuple[int, int], rng: np.random.Generator, augment: AugmentConfig
 ) -> tuple[Image, Array]:
     """Samples in strips of equal height on one canvas, and target rows (T, 6): class or -1, x0, y0, x1, y1 (px), ignore."""
-    height = canvas[1] // len(samples)
-    images, rows = [], []
-    for number, sample in enumerate(samples):
-        image, targets = augmented(sample, (canvas[0], height), rng, augment)
-        images.append(image)
-        rows.append(targets + number * height * np.array([0, 0, 1, 0, 1, 0]))
-    return np.concatenate(images), np.concatenate(rows)
+    size = canvas[0], canvas[1] // len(samples)
+    return _tiled([augmented(sample, size, rng, augment) for sample in samples], canvas, columns=1)
+
+
+def tiled(
+    samples: Sequence[DetectionSample], canvas: tuple[int, int], rng: np.random.Generator, augment: AugmentConfig
+) -> tuple[Image, Array]:
+    """As :func:`stacked`, in two columns and each sample made smaller: small vehicles, and many of them.
+
+    After the mosaic of YOLOv4 (Bochkovskiy et al., 2020), of which the cells keep their size. The samples are even in number.
+    """
+    size = canvas[0] // 2, 2 * canvas[1] // len(samples)
+    return _tiled([augmented(sample, size, rng, augment, smaller=True) for sample in samples], canvas, columns=2)
+
+
+def _tiled(cells: Sequence[tuple[Image, Array]], canvas: tuple[int, int], columns: int) -> tuple[Image, Array]:
+    """Pictures of one size with their target rows, side by side, row by row; what they leave of the canvas is grey."""
+    image, rows = np.full((canvas[1], canvas[0], 3), PAD_VALUE, np.uint8), []
+    for number, (cell, targets) in enumerate(cells):
+        height, width = cell.shape[:2]
+        y, x = height * (number // columns), width * (number % columns)
+        image[y : y + height, x : x + width] = cell
+        rows.append(targets + np.array([0, x, y, x, y, 0]))
+    return image, np.concatenate(rows)
 
 
 def augmented(
-    sample: DetectionSample, size: tuple[int, int], rng: np.random.Generator, augment: AugmentConfig
+    sample: DetectionSample,
+    size: tuple[int, int],
+    rng: np.random.Generator,
+    augment: AugmentConfig,
+    *,
+    smaller: bool = False,
 ) -> tuple[Image, Array]:
-    """One sample on a canvas of ``size`` (width, height), and its target rows (T, 6)."""
+    """One sample on a canvas of ``size`` (width, height), and its target rows (T, 6). smaller: always reduced."""
     image, xyxy = sample.canvas, sample.xyxy_px
     if rng.random() < augment.flip:
         image, xyxy = flip_horizontally(image, xyxy, sample.image_size[0])
-    if rng.random() < augment.geometric:
+    if smaller:
+        image, xyxy = shrink(image, xyxy, size, rng, augment)
+    elif rng.random() < augment.geometric:
         image, xyxy = rescale(image, xyxy, size, rng, augment)
     else:
         image, xyxy = place(image, xyxy, size, rng)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable
 from copy import copy
 from dataclasses import asdict, replace
 from typing import Any
@@ -13,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from models_export.data.ahead import mapped_ahead
 from models_export.data.augment import NO_AUGMENT, AugmentConfig, hidden_behind, photometric
 from models_export.data.detection import VehicleSample
 from models_export.data.vehicles import Vehicle, vehicles_of
@@ -42,7 +42,7 @@ class MultibinTask:
 
     def __init__(
         self,
-        samples: Sequence[VehicleSample],
+        samples: Iterable[VehicleSample],
         config: MultibinConfig | VggMultibinConfig,
         augment: AugmentConfig | None = None,
         *,
@@ -61,7 +61,7 @@ class MultibinTask:
     def __len__(self) -> int:
         return len(self.vehicles)
 
-    def held_out(self, samples: Sequence[VehicleSample]) -> MultibinTask:
+    def held_out(self, samples: Iterable[VehicleSample]) -> MultibinTask:
         """The same network and configuration over other samples, which are not augmented: for validation."""
         other = copy(self)
         other.vehicles, other.augment = _vehicles(samples, self.config), NO_AUGMENT
@@ -121,11 +121,10 @@ class MultibinTask:
         return {**paper, **likelihood, "places": places, "total": total}
 
 
-def _vehicles(samples: Sequence[VehicleSample], config: MultibinConfig | VggMultibinConfig) -> list[Vehicle]:
-    # Decoders let go of the interpreter's lock.
-    with ThreadPoolExecutor() as pool:
-        parts = pool.map(lambda sample: vehicles_of(sample, config.max_width), samples)
-        return [vehicle for part in parts for vehicle in part]
+def _vehicles(samples: Iterable[VehicleSample], config: MultibinConfig | VggMultibinConfig) -> list[Vehicle]:
+    # Samples are let go as soon as their vehicles are cut out: frames of many scenes would not fit into memory.
+    parts = mapped_ahead(lambda sample: vehicles_of(sample, config.max_width), samples)
+    return [vehicle for part in parts for vehicle in part]
 
 
 def angle_error(vectors: Tensor, alpha: Tensor, bin_centers: Tensor) -> Tensor:

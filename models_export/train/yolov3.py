@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 from torch import Tensor, nn
 
@@ -21,7 +21,7 @@ class Yolov3Task(BoxTask):
 
     def __init__(
         self,
-        samples: Sequence[DetectionSample],
+        samples: Iterable[DetectionSample],
         config: Yolov3Config,
         augment: AugmentConfig | None = None,
         mix: MixConfig | None = None,

@@ -19,6 +19,7 @@ from models_export.data.augment import (
     photometric,
     place,
     rescale,
+    shrink,
     streaked,
     veiled,
 )
@@ -117,3 +118,23 @@ def test_placing_cuts_or_pads_without_scaling(size: tuple[int, int]) -> None:
     x, y = box[0, :2].astype(int)
     if x >= 0 and y >= 0 and x + 21 <= size[0] and y + 21 <= size[1]:
         np.testing.assert_array_equal(placed[y : y + 21, x : x + 21], image[20:41, 10:31])
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([(80, 64), (120, 80), (320, 40)]))
+def test_a_shrunk_image_fills_the_canvas_as_far_as_it_can_and_keeps_boxes_on_what_they_frame(
+    seed: int, size: tuple[int, int]
+) -> None:
+    image = np.full((128, 192, 3), 20, np.uint8)
+    image[40:80, 60:140] = 220
+    config = AugmentConfig()
+    canvas, box = shrink(image, np.array([[60.0, 40.0, 139.0, 79.0]]), size, np.random.default_rng(seed), config)
+    assert canvas.shape == (size[1], size[0], 3)
+    scale = (box[0, 2] - box[0, 0]) / 79
+    assert config.tile_scale[0] - 1e-9 <= scale <= config.tile_scale[1] + 1e-9
+    # Grey is left along an axis only where the whole picture does not reach, up to the interpolated rim.
+    for axis, canvas_side, side in ((0, size[1], 128), (1, size[0], 192)):
+        grey = np.abs(canvas.astype(int) - 114).max((1 - axis, 2)) < 3
+        assert grey.sum() <= max(canvas_side - scale * side, 0) + 2
+    x0, y0, x1, y1 = np.clip(box[0], 0, np.array([*size, *size]) - 1)
+    inner = canvas[int(np.ceil(y0 + 1)) : int(y1), int(np.ceil(x0 + 1)) : int(x1)]
+    assert inner.size == 0 or inner.min() > 150

@@ -71,6 +71,32 @@ def test_low_pictures_are_stacked_until_they_fill_the_canvas(toy_samples: list[S
         assert batch["images"][row, y0 : y1 + 1, x0 : x1 + 1].numpy().max(2).min() > 150
 
 
+def test_tiled_pictures_are_four_times_as_many_and_smaller(toy_samples: list[Sample]) -> None:
+    low = [replace(sample, source="simulated/toy") for sample in toy_samples]
+    augment = replace(NO_AUGMENT, tiles=1.0, tile_scale=(0.5, 0.5))
+    task = DetectorTask([*low, tall(low[0])], DetectorConfig(), augment, MIX)
+    batch = task.batch(np.array([0, 8]), np.random.default_rng(0))
+    assert batch["images"].shape == (2, 192, 160, 3)
+    targets = batch["targets"].numpy()
+    # Eight low pictures at half size fill the canvas, and four tall ones; each shows its two or four vehicles whole.
+    for row, vehicles in ((0, 16), (1, 16)):
+        boxes = targets[targets[:, 0] == row, 2:6]
+        assert len(boxes) == vehicles
+        assert (boxes[:, 2] - boxes[:, 0]).max() <= 22
+        cell = np.array([80, 48]) if row == 0 else np.array([80, 96])
+        assert np.all(boxes[:, :2] // cell == boxes[:, 2:] // cell)
+        assert len(np.unique(boxes[:, :2] // cell, axis=0)) == (8, 4)[row]
+
+
+def test_strips_that_do_not_divide_the_canvas_leave_it_grey(toy_samples: list[Sample]) -> None:
+    low = [replace(sample, source="simulated/toy") for sample in toy_samples]
+    high = replace(tall(low[0]), canvas=np.full((352, 160, 3), 50, np.uint8))
+    task = DetectorTask([*low, high], DetectorConfig(), NO_AUGMENT, MIX)
+    images = task.batch(np.array([0, 8]), np.random.default_rng(0))["images"].numpy()
+    assert images.shape == (2, 352, 160, 3)
+    assert (images[0, 351] == 114).all()
+
+
 def test_batches_repeat_and_follow_the_mix(toy_samples: list[Sample]) -> None:
     task = DetectorTask(renamed(toy_samples), DetectorConfig(), mix=MIX)
     indices = task.draw(np.random.default_rng(1), 300)

@@ -80,7 +80,7 @@ def test_alpha_follows_the_ray_through_the_crop() -> None:
 
 def test_a_large_vehicle_is_kept_small_and_its_edges_agree_with_the_service() -> None:
     vehicle = white_box([20, 20, 380, 200])
-    assert max(vehicle.patch.shape) <= 224
+    assert max(vehicle.patch.shape) <= 176
     _, _, outline = vehicle.crop(vehicle.xyxy_px, 96)
     windows = crop_windows([vehicle.xyxy_px])
     np.testing.assert_allclose(edges_in_image([outline[:4]], windows)[0], vehicle.xyxy_px, atol=4.0)
