@@ -120,8 +120,8 @@ def train(
     """Train one network on the training scenes of ``data``; checkpoint, logs and curves go to ``out``.
 
     real: recordings, for the networks that learn from them too. init: a file or folder of weights to start from, an earlier
-    run's checkpoint or a pack's ONNX file of this network; when resuming, only the latter two are read. Raises InputError for
-    an unknown network, too little data, and weights that do not fit, NotFoundError for recordings that are not there.
+    run's checkpoint or a pack's ONNX file of this network; when resuming it is not read. Raises InputError for an unknown
+    network, too little data, and weights that do not fit, NotFoundError for recordings that are not there.
     """
     network = recipe.network(name)
     training, held_out = (recipe.samples(scenes) for scenes in split_scenes(data))
@@ -131,13 +131,14 @@ def train(
     torch.manual_seed(network.training.seed)
     task = network.task(chain(training, added), network.config)
     before = None
-    if init is not None and init.suffix == exported.SUFFIX:
-        # When resuming, too: the priors that its weights are bound to are part of the run.
+    if init is not None and resume:
+        before = checkpoint.begun_with(task, out / f"{name}{checkpoint.SUFFIX}")
+    elif init is not None and init.suffix == exported.SUFFIX:
         exported.load_exported(task, init)
         before = exported.provenance(init)
     elif init is not None and init.suffix == checkpoint.SUFFIX:
         before = checkpoint.go_on_from(task, init)
-    elif init is not None and not resume:
+    elif init is not None:
         network.load_pretrained(task.net, init)
     config = replace(
         network.training,

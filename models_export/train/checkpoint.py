@@ -76,6 +76,16 @@ def go_on_from(task: Task, path: Path) -> dict[str, Any]:
     return {"taken_from": path.name, "training": state["config"], "task": state["task"], "steps": state["step"]}
 
 
+def begun_with(task: Task, path: Path) -> Any:
+    """For a run that goes on from its own checkpoint: what ``go_on_from`` or an exported file gave it at the start.
+
+    The priors become the task's; returned is how the first weights came about. Raises InputError when there is no checkpoint.
+    """
+    state = read_checkpoint(path)
+    task.config = task.net.config = with_priors(task.config, state["task"].get("net", {}))
+    return state["config"]["before"]
+
+
 def checkpoint_or(read: Callable[[Any, Path], object]) -> Callable[[Any, Path], None]:
     """What starts a network from an earlier run's checkpoint (``.pt``), or from any other file or folder through ``read``."""
 

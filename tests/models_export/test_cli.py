@@ -82,6 +82,22 @@ def test_options_reach_the_run(toy_scenes: Path, tmp_path: Path, runs: Path, mon
     run_train("depth", toy_scenes, tmp_path, *epoch, "--resume")
 
 
+def test_a_run_that_overwrites_what_it_began_with_can_be_resumed(
+    toy_scenes: Path, tmp_path: Path, runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("models_export.cli.edge_recipe", small_recipe)
+    own = tmp_path / "multibin.pt"
+    own.write_bytes((runs / "multibin.pt").read_bytes())
+    began = ("--steps", "2", "--batch-size", "4", "--init", str(own))
+    run_train("multibin", toy_scenes, tmp_path, *began)
+    first = read_checkpoint(own)
+    assert first["config"]["before"]["steps"] == 6
+    run_train("multibin", toy_scenes, tmp_path, *began, "--resume")
+    again = read_checkpoint(own)
+    assert again["config"] == first["config"]
+    assert again["task"] == first["task"]
+
+
 def test_a_pack_goes_from_checkpoints_to_the_service(
     toy_scenes: Path, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
