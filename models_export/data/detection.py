@@ -50,7 +50,7 @@ class DetectionSample:
 
 
 @dataclass(frozen=True, eq=False)
-class Still:
+class EncodedStill:
     """A frame as it came from its camera."""
 
     data: bytes
@@ -76,7 +76,7 @@ class VehicleSample(DetectionSample):
     """(N,) heading relative to the ray through the 2D box's centre, radians."""
     corners_px: Array
     """(N, 8, 2) corners of the 3D boxes, px, wherever they fall; they mean something where all are in front of the camera."""
-    still: Still | None = field(default=None, kw_only=True)
+    still: EncodedStill | None = field(default=None, kw_only=True)
     """The frame, for those who want it larger than the detector does; None: there is no more than the canvas."""
 
 

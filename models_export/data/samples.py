@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from models_export.data.ahead import mapped_ahead
 from models_export.data.dataset import UNKNOWN_CONDITION, Scene, SceneTruth, list_scenes, open_scene
-from models_export.data.detection import MIN_SIDE_PX, VEHICLES, Still, VehicleSample, class_columns
+from models_export.data.detection import MIN_SIDE_PX, VEHICLES, EncodedStill, VehicleSample, class_columns
 from service.errors import InputError
 from service.geometry.boxes import clip_extents, extents_of, project_corners
 from service.geometry.camera import Camera, ray_azimuth
@@ -95,7 +95,7 @@ def _load_sample(
     max_width: int,
     depth_stride: int,
 ) -> Sample:
-    still = Still(scene.frame_bytes(camera.id, step), camera)
+    still = EncodedStill(scene.frame_bytes(camera.id, step), camera)
     image, scaled = still.at(max_width)
     corners, in_front = project_corners(scaled, truth.center, truth.dims_lwh, truth.yaw)
     kinds = np.array(truth.kinds, dtype=str)
