@@ -182,16 +182,23 @@ def client(start: Callable[..., ServiceClient]) -> ServiceClient:
     return start()
 
 
-def open_and_never_read(address: str, path: str = "/stream/demo") -> socket.socket:
-    """A WebSocket peer, by default a subscriber, with small buffers that takes no byte after the handshake."""
+def ask_for_websocket(address: str, path: str) -> socket.socket:
+    """A WebSocket peer with a small buffer that has asked for the handshake, and not yet read the answer."""
     host, port = address.split(":")
     raw = socket.socket()
     raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    raw.settimeout(10)
     raw.connect((host, int(port)))
     raw.sendall(
         f"GET {path} HTTP/1.1\r\nHost: {address}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
         "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n".encode()
     )
+    return raw
+
+
+def open_and_never_read(address: str, path: str = "/stream/demo") -> socket.socket:
+    """A WebSocket peer, by default a subscriber, with a small buffer that takes no byte after the handshake."""
+    raw = ask_for_websocket(address, path)
     assert b"101" in raw.recv(16)
     return raw
 
@@ -200,6 +207,7 @@ class Tools:
     """What tests of the API use; a fixture, since test modules import nothing from each other."""
 
     jpeg = staticmethod(jpeg)
+    ask_for_websocket = staticmethod(ask_for_websocket)
     open_and_never_read = staticmethod(open_and_never_read)
     png = staticmethod(png)
     one_box = staticmethod(one_box)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import struct
 import threading
@@ -10,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from starlette.websockets import WebSocket
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
@@ -168,6 +170,29 @@ def test_a_sender_that_was_cut_and_sends_on_is_not_read_any_more(start: Callable
             stranger.sendall(10_000_000 * small_text)
         assert client.get("/health/live").status_code == 200
     assert drops(client) == {"frame_refused": 1}
+
+
+def test_messages_that_come_before_the_handshake_is_answered_wait_for_it(
+    client: Any, tools: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    accept = WebSocket.accept
+
+    async def accept_late(websocket: WebSocket) -> None:
+        await asyncio.sleep(0.3)
+        await accept(websocket)
+
+    monkeypatch.setattr(WebSocket, "accept", accept_late)
+    monkeypatch.setattr(ingest, "_PAUSE_S", 0.0)
+    with tools.ask_for_websocket(client.address, "/ingest/demo") as hasty:
+        time.sleep(0.1)
+        hasty.sendall(3 * b"\x81\x81\0\0\0\0x")
+        answer = b""
+        while answer.count(b"Send binary messages") < 3:
+            part = hasty.recv(4096)
+            assert part, answer
+            answer += part
+    assert answer.startswith(b"HTTP/1.1 101")
+    assert not [record for record in caplog.records if record.exc_info]
 
 
 def test_a_sender_of_rubbish_is_read_slowly_and_one_broken_frame_costs_nothing(
