@@ -19,7 +19,7 @@ demo: $(VENV)/.ready-demo
 	@$(BIN)/quadlift demo $(ARGS)
 
 test: $(VENV)/.ready-dev
-	@$(BIN)/python -m pytest $(ARGS)
+	@$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile $(ARGS)
 
 check: $(VENV)/.ready-dev
 	@scripts/check
