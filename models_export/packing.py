@@ -267,7 +267,7 @@ def _image_batches(samples: list[Sample], fit: InputFit) -> list[Images]:
 
 
 def _crop_batches(samples: list[Sample], config: Any) -> list[Images]:
-    vehicles = [vehicle for sample in samples for vehicle in vehicles_of(sample, config.max_width)]
+    vehicles = [vehicle for sample in samples for vehicle in vehicles_of(sample, config.crop_px, config.max_width)]
     crops = np.stack([vehicle.crop(vehicle.xyxy_px, config.crop_px)[0] for vehicle in vehicles])
     return [crops[i : i + _CROPS] for i in range(0, max(len(crops) - _CROPS, 0) + 1, _CROPS)]
 

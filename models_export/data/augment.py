@@ -194,7 +194,7 @@ def rescale(
 
     The image's centre goes to the canvas's, up to the shift.
     """
-    scale = float(np.exp(rng.uniform(*np.log(config.scale))))
+    scale = _factor(config.scale, rng)
     canvas, middle = np.array(size, dtype=np.float64), np.array(image.shape[1::-1]) / 2
     shift = rng.uniform(-config.shift, config.shift, 2) * canvas
     return _moved(image, xyxy_px, size, scale, canvas / 2 + shift - scale * middle)
@@ -213,9 +213,14 @@ def shrink(
 ) -> tuple[Image, Array]:
     """A random part of an image and its boxes, made smaller, on a canvas of ``size`` (width, height): grey only where the
     whole image does not fill it."""
-    scale = float(np.exp(rng.uniform(*np.log(config.tile_scale))))
+    scale = _factor(config.tile_scale, rng)
     spare = np.array(size) - scale * np.array(image.shape[1::-1])
     return _moved(image, xyxy_px, size, scale, rng.uniform(np.minimum(spare, 0.0), np.maximum(spare, 0.0)))
+
+
+def _factor(limits: tuple[float, float], rng: np.random.Generator) -> float:
+    """A factor between limits, drawn evenly in its logarithm."""
+    return float(np.exp(rng.uniform(*np.log(limits))))
 
 
 def _moved(image: Image, xyxy_px: Array, size: tuple[int, int], scale: float, offset: Array) -> tuple[Image, Array]:

@@ -17,8 +17,9 @@ from service.nets.multibin import CONTEXT, crop_vehicles, crop_windows
 
 _ROOM = 1.7
 """Side of the kept picture over that of an exact crop: what jitter of the box may reach."""
-_MAX_PATCH_PX = 176
-"""Longer sides are reduced: crops are smaller still."""
+_MOST_OVER_CROP = 1.84
+"""Longest side of a kept picture over that of a head's crops, px; longer ones are reduced. With ``_ROOM`` around it, an exact
+crop loses nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +72,11 @@ class Vehicle:
         return crop, alpha, np.concatenate([edges, tangents])
 
 
-def vehicles_of(sample: VehicleSample, max_width: int | None = None) -> list[Vehicle]:
+def vehicles_of(sample: VehicleSample, crop_px: int, max_width: int | None = None) -> list[Vehicle]:
     """The vehicles of a sample that a detector is asked for and whose class is known.
 
-    max_width: width to which the sample's frame is decoded for them, px; None, or a sample without a frame: out of its canvas,
-    no larger than the detector sees them.
+    crop_px: side of the crops that a head reads. max_width: width to which the sample's frame is decoded for them, px; None, or
+    a sample without a frame: out of its canvas, no larger than the detector sees them.
     """
     width, height = sample.image_size
     image, camera = sample.canvas[:height, :width], sample.camera
@@ -86,7 +87,8 @@ def vehicles_of(sample: VehicleSample, max_width: int | None = None) -> list[Veh
     tangents = tangents_of(scaled_points(sample.corners_px, factor))
     weather = sample.labels.get("weather", UNKNOWN_CONDITION)
     rows = np.flatnonzero(~sample.ignore & sample.class_known)
-    return [_cut(image, camera, boxes[row], tangents[row], sample, row, weather) for row in rows]
+    most_px = int(_MOST_OVER_CROP * crop_px)
+    return [_cut(image, camera, boxes[row], tangents[row], sample, row, weather, most_px) for row in rows]
 
 
 def _cut(
@@ -97,6 +99,7 @@ def _cut(
     sample: VehicleSample,
     row: int,
     weather: str,
+    most_px: int,
 ) -> Vehicle:
     """The vehicle in a row of a sample, whose box (4,) and tangents (8,) are those in an image of the camera's size."""
     half = 0.5 * _ROOM * CONTEXT * float((xyxy_px[2:] - xyxy_px[:2]).max())
@@ -104,7 +107,7 @@ def _cut(
     x0, y0 = np.maximum(np.floor(center - half), 0).astype(int)
     x1, y1 = np.minimum(np.ceil(center + half), image.shape[1::-1]).astype(int)
     patch = image[y0:y1, x0:x1]
-    reduction = _MAX_PATCH_PX / max(patch.shape)
+    reduction = most_px / max(patch.shape)
     if reduction < 1:
         patch = cv2.resize(patch, None, fx=reduction, fy=reduction, interpolation=cv2.INTER_AREA)
     return Vehicle(

@@ -18,7 +18,7 @@ from models_export.anchors import Clusters, anchors_of
 from models_export.data.augment import NO_AUGMENT, AugmentConfig
 from models_export.data.detection import DetectionSample
 from models_export.data.mix import MixConfig, draw_by_odds, draw_odds
-from models_export.train.detector_pictures import canvas_of, stacked, strips_on, tiled
+from models_export.train.detector_pictures import canvas_of, strips_on, tiled
 from models_export.train.task import Batch, ParameterGroup, decayed_groups
 from service.geometry.transforms import Array
 
@@ -99,12 +99,11 @@ class BoxTask:
     def _picture(self, index: int, rng: np.random.Generator) -> tuple[np.ndarray, Array]:
         sample = self.samples[index]
         if self.canvas_px is None:
-            return stacked([sample], (sample.canvas.shape[1], sample.canvas.shape[0]), rng, self.augment)
+            return tiled([sample], (sample.canvas.shape[1], sample.canvas.shape[0]), rng, self.augment)
         strips = strips_on(self.canvas_px, sample)
-        smaller = rng.random() < self.augment.tiles
-        others = rng.choice(self._like[_likeness(sample)], size=(4 * strips if smaller else strips) - 1)
-        pictures = [sample, *(self.samples[i] for i in others)]
-        return (tiled if smaller else stacked)(pictures, self.canvas_px, rng, self.augment)
+        columns = 2 if rng.random() < self.augment.tiles else 1
+        others = rng.choice(self._like[_likeness(sample)], size=columns**2 * strips - 1)
+        return tiled([sample, *(self.samples[i] for i in others)], self.canvas_px, rng, self.augment, columns)
 
     @cached_property
     def _like(self) -> dict[tuple[str, int], list[int]]:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from models_export.train.config import with_priors
+from models_export.train.config import take_priors
 from models_export.train.task import Task
 from service.errors import InputError
 
@@ -72,7 +72,7 @@ def go_on_from(task: Task, path: Path) -> dict[str, Any]:
     Returns how they came about, for the record. Raises InputError when they do not fit.
     """
     state = load_checkpoint(task.net, path)
-    task.config = task.net.config = with_priors(task.config, state["task"]["net"])
+    take_priors(task, state["task"]["net"])
     return {"taken_from": path.name, "training": state["config"], "task": state["task"], "steps": state["step"]}
 
 
@@ -82,7 +82,7 @@ def begun_with(task: Task, path: Path) -> Any:
     The priors become the task's; returned is how the first weights came about. Raises InputError when there is no checkpoint.
     """
     state = read_checkpoint(path)
-    task.config = task.net.config = with_priors(task.config, state["task"].get("net", {}))
+    take_priors(task, state["task"]["net"])
     return state["config"]["before"]
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, get_args
 
+from models_export.train.task import Task
 from service.errors import InputError
 
 Optimizer = Literal["adamw", "adam", "sgd"]
@@ -112,10 +113,11 @@ def nested_tuples(rows: Any) -> Any:
     return tuple(nested_tuples(row) for row in rows) if isinstance(rows, list | tuple) else rows
 
 
-def with_priors(config: Any, values: Mapping[str, Any]) -> Any:
-    """A network's configuration with the priors among ``values``: what training data decide, and weights are bound to."""
-    known = {field.name for field in fields(config)}
-    return replace(config, **{name: nested_tuples(values[name]) for name in _PRIORS if name in known and name in values})
+def take_priors(task: Task, values: Mapping[str, Any]) -> None:
+    """Give a task and its network the priors among ``values``: what training data decide, and weights are bound to."""
+    known = {field.name for field in fields(task.config)}
+    priors = {name: nested_tuples(values[name]) for name in _PRIORS if name in known and name in values}
+    task.config = task.net.config = replace(task.config, **priors)
 
 
 def decisive(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -30,30 +30,22 @@ def strips_on(canvas: tuple[int, int], sample: DetectionSample) -> int:
     return max(canvas[1] // sample.canvas.shape[0], 1)
 
 
-def stacked(
-    samples: Sequence[DetectionSample], canvas: tuple[int, int], rng: np.random.Generator, augment: AugmentConfig
-) -> tuple[Image, Array]:
-    """Samples in strips of equal height on one canvas, and target rows (T, 6): class or -1, x0, y0, x1, y1 (px), ignore."""
-    size = canvas[0], canvas[1] // len(samples)
-    return _tiled([augmented(sample, size, rng, augment) for sample in samples], canvas, columns=1)
-
-
 def tiled(
-    samples: Sequence[DetectionSample], canvas: tuple[int, int], rng: np.random.Generator, augment: AugmentConfig
+    samples: Sequence[DetectionSample],
+    canvas: tuple[int, int],
+    rng: np.random.Generator,
+    augment: AugmentConfig,
+    columns: int = 1,
 ) -> tuple[Image, Array]:
-    """As :func:`stacked`, in two columns and each sample made smaller: small vehicles, and many of them.
+    """Samples side by side, row by row, on one canvas, and target rows (T, 6): class or -1, x0, y0, x1, y1 (px), ignore.
 
-    After the mosaic of YOLOv4 (Bochkovskiy et al., 2020), of which the cells keep their size. The samples are even in number.
+    In one column samples are strips. In more, which divide their number, each is made smaller: small vehicles, and many of
+    them, after the mosaic of YOLOv4 (Bochkovskiy et al., 2020), of which the cells keep their size. What they leave is grey.
     """
-    size = canvas[0] // 2, 2 * canvas[1] // len(samples)
-    return _tiled([augmented(sample, size, rng, augment, smaller=True) for sample in samples], canvas, columns=2)
-
-
-def _tiled(cells: Sequence[tuple[Image, Array]], canvas: tuple[int, int], columns: int) -> tuple[Image, Array]:
-    """Pictures of one size with their target rows, side by side, row by row; what they leave of the canvas is grey."""
+    width, height = canvas[0] // columns, canvas[1] * columns // len(samples)
     image, rows = np.full((canvas[1], canvas[0], 3), PAD_VALUE, np.uint8), []
-    for number, (cell, targets) in enumerate(cells):
-        height, width = cell.shape[:2]
+    for number, sample in enumerate(samples):
+        cell, targets = augmented(sample, (width, height), rng, augment, smaller=columns > 1)
         y, x = height * (number // columns), width * (number % columns)
         image[y : y + height, x : x + width] = cell
         rows.append(targets + np.array([0, x, y, x, y, 0]))

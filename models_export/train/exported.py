@@ -17,7 +17,7 @@ from google.protobuf.message import DecodeError
 from onnx import numpy_helper
 from torch import Tensor, nn
 
-from models_export.train.config import with_priors
+from models_export.train.config import take_priors
 from models_export.train.task import Batch, Task
 from service.errors import InputError
 from service.geometry.transforms import Array
@@ -43,7 +43,7 @@ def load_exported(task: Task, path: Path) -> None:
         raise InputError(
             f"holds no weights of this network: {error}", field=str(path), remedy="Give the file of its role in a pack."
         ) from error
-    task.config = task.net.config = with_priors(task.config, _metadata(model))
+    take_priors(task, _metadata(model))
     indices = np.linspace(0, len(task) - 1, min(len(task), _CALIBRATION_ITEMS)).astype(np.int64)
     _unfold(task, folded, task.batch(indices, np.random.default_rng(0)))
 

@@ -123,7 +123,7 @@ class MultibinTask:
 
 def _vehicles(samples: Iterable[VehicleSample], config: MultibinConfig | VggMultibinConfig) -> list[Vehicle]:
     # Samples are let go as soon as their vehicles are cut out: frames of many scenes would not fit into memory.
-    parts = mapped_ahead(lambda sample: vehicles_of(sample, config.max_width), samples)
+    parts = mapped_ahead(lambda sample: vehicles_of(sample, config.crop_px, config.max_width), samples)
     return [vehicle for part in parts for vehicle in part]
 
 

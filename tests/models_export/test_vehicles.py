@@ -43,7 +43,8 @@ def white_box(xyxy: list[int]) -> Vehicle:
             dims_lwh=np.array([[4.0, 1.8, 1.5]]),
             alpha=np.array([0.4]),
             corners_px=outline_of([x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5]),
-        )
+        ),
+        crop_px=96,
     )
     return vehicle
 
