@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.frames import FrameSet
-from service.measuring import cut_detected
+from service.measuring import cut_detected, second_looks
 from service.nets.canvas import Canvases
 from service.pipeline import Pipeline
 
@@ -22,8 +22,8 @@ PREPARE_S = 10.0
 @dataclass(frozen=True, eq=False)
 class _Work:
     frame_set: FrameSet
-    crops: NDArray[np.uint8]
-    """What the multi-bin head gets for this set, cut beforehand."""
+    crops: tuple[NDArray[np.uint8], ...]
+    """What the multi-bin head gets for this set at each look, cut beforehand."""
 
 
 class BareLoop:
@@ -58,8 +58,8 @@ class BareLoop:
         for network, fit in ((pipeline.detector.network, pipeline.detector.fit), (pipeline.depth.network, pipeline.depth.fit)):
             for batch in canvases.batches(fit):
                 network.run(batch.pixels)
-        if len(work.crops):
-            pipeline.multibin.network.run(work.crops)
+        for crops in work.crops:
+            pipeline.multibin.network.run(crops)
 
     def _prepared(self, sets: Sequence[FrameSet]) -> list[_Work]:
         """As many of the sets as are prepared in ``PREPARE_S``: all of them, unless the networks are slow."""
@@ -74,4 +74,8 @@ class BareLoop:
         stills, settings = self._pipeline.decode(frame_set)[0], self._pipeline.settings
         images = [still.small for still in stills]
         found = self._pipeline.detector.detect(images, score_threshold=settings.score_threshold, nms_iou=settings.nms_iou)
-        return _Work(frame_set, cut_detected(stills, found, self._pipeline.multibin.spec.crop_px).pixels)
+        head = self._pipeline.multibin
+        first = cut_detected(stills, found, head.spec.crop_px)
+        estimates = head.estimate(first, np.concatenate([own.cls for own in found]))
+        _, second = second_looks(stills, found, estimates, head.spec.crop_px, settings.refine_shift)
+        return _Work(frame_set, tuple(crops.pixels for crops in (first, second) if len(crops)))

@@ -13,6 +13,7 @@ from models_export.train.config import TrainConfig
 from models_export.train.depth import DepthTask
 from models_export.train.detector import DetectorTask
 from models_export.train.multibin import MultibinTask
+from models_export.train.nanodet_start import load_nanodet
 
 
 def edge_recipe(
@@ -43,6 +44,7 @@ def _detector(config: DetectorConfig) -> NetworkRecipe:
         training=TrainConfig(steps=12000, batch_size=16),
         outputs=("p8", "p16", "p32"),
         metadata=detector_metadata,
+        load_foreign=load_nanodet,
         real=RealData.detection,
         precision="int8",
     )

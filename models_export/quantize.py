@@ -15,7 +15,7 @@ from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, Q
 
 from models_export.nets.blocks import PIXEL_OFFSET, PIXEL_SCALE
 
-QUANTIZED_OPS = ["Conv", "Relu", "Add", "Resize", "MatMul", "Gemm"]
+QUANTIZED_OPS = ["Conv", "Relu", "Add", "Resize", "MatMul", "Gemm", "Concat", "MaxPool", "AveragePool"]
 """Operators that run in int8; all others stay in float. Relu is among them so that chains of convolutions stay in int8."""
 
 _NORMALISATION = ("Transpose", "Cast", "Mul", "Sub")

@@ -65,6 +65,8 @@ class NetworkRecipe:
     """In which it is exported unless asked otherwise."""
     load_pretrained: Callable[[Any, Path], object] = load_checkpoint
     """Puts the weights of a user's file or folder into the network: what ``--init`` names."""
+    load_foreign: Callable[[Task, Path], dict[str, Any]] | None = None
+    """Puts the weights of an ONNX file that is no pack's into the network, and says whose they are."""
     real: Callable[[RealData, tuple[str, ...], int], tuple[Sequence[DetectionSample], Sequence[DetectionSample]]] = no_samples
     """What recordings add to the training and to the held-out samples, for given classes and width of images, px."""
     for_export: Callable[[Any], nn.Module] = unchanged
@@ -134,8 +136,7 @@ def train(
     if init is not None and resume:
         before = checkpoint.begun_with(task, out / f"{name}{checkpoint.SUFFIX}")
     elif init is not None and init.suffix == exported.SUFFIX:
-        exported.load_exported(task, init)
-        before = exported.provenance(init)
+        before = _from_onnx(network, task, init)
     elif init is not None and init.suffix == checkpoint.SUFFIX:
         before = checkpoint.go_on_from(task, init)
     elif init is not None:
@@ -147,6 +148,14 @@ def train(
         recordings=real.credits() if real and added else (),
     )
     return fit(task, config, out, task.held_out(chain(held_out, checked)), resume=resume)
+
+
+def _from_onnx(network: NetworkRecipe, task: Task, path: Path) -> dict[str, Any] | None:
+    """Start from an ONNX file, of a pack or of others; returns how its weights came about."""
+    if network.load_foreign is not None and not exported.is_ours(path):
+        return network.load_foreign(task, path)
+    exported.load_exported(task, path)
+    return exported.provenance(path)
 
 
 def resolved_config(network: NetworkRecipe, saved: Mapping[str, Any]) -> Any:

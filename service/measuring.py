@@ -74,26 +74,34 @@ def _in_image(stills: Sequence[Still], found: Sequence[Detections]) -> list[Arra
 def refined(
     stills: Sequence[Still], found: Sequence[Detections], estimates: MultibinEstimates, head: Multibin, least_shift: float
 ) -> MultibinEstimates:
-    """Estimates of which those are read again whose outlines and detected boxes disagree.
+    """Estimates of which those are read again whose outlines and detected boxes disagree."""
+    again, crops = second_looks(stills, found, estimates, head.spec.crop_px, least_shift)
+    if not len(again):
+        return estimates
+    cls = np.concatenate([own.cls for own in found])
+    return estimates.with_rows(again, head.estimate(crops, cls[again]))
+
+
+def second_looks(
+    stills: Sequence[Still], found: Sequence[Detections], estimates: MultibinEstimates, crop_px: int, least_shift: float
+) -> tuple[NDArray[np.int64], Crops]:
+    """Which vehicles (M,) are to be read again, and their crops (M).
 
     A head reads best what its crop shows in the middle. Where an edge that it read lies farther from the detector's than
     ``least_shift`` of the box's longer side, a second crop is cut around the outline.
     """
+    none = np.zeros(0, np.int64), Crops(np.zeros((0, crop_px, crop_px, 3), np.uint8), np.zeros((0, 3), np.int64))
     if estimates.xyxy_px is None or not len(estimates.alpha):
-        return estimates
+        return none
     index = np.repeat(np.arange(len(stills)), [len(own) for own in found])
     boxes = np.concatenate(_in_image(stills, found))
     side = (boxes[:, 2:] - boxes[:, :2]).max(1)
     shift = np.abs(estimates.xyxy_px - boxes).max(1) / np.maximum(side, 1.0)
     again = np.flatnonzero((shift > least_shift) & (shift < _MOST_SHIFT))
     if not len(again):
-        return estimates
-    crops = [
-        cut_crops(still.image, estimates.xyxy_px[again[index[again] == row]], head.spec.crop_px)
-        for row, still in enumerate(stills)
-    ]
-    cls = np.concatenate([own.cls for own in found])
-    return estimates.with_rows(again, head.estimate(Crops.concatenate(crops), cls[again]))
+        return none
+    crops = [cut_crops(still.image, estimates.xyxy_px[again[index[again] == row]], crop_px) for row, still in enumerate(stills)]
+    return again, Crops.concatenate(crops)
 
 
 def measure(

@@ -17,12 +17,12 @@ class MixConfig:
     """Shares of the draws by the first part of a sample's source; those of the data sets present are scaled to sum to 1."""
 
     shares: tuple[tuple[str, float], ...] = (
-        ("simulated", 0.5),
+        ("simulated", 0.4),
         # One camera filmed all of the gantry's frames: at most 40 % of the roadside share.
         ("rf100_vehicles_tollroad_id", 0.09),
-        ("atl_v2_highway_mix", 0.09),
-        ("farzad_overpass_vehicle_boxonly", 0.07),
-        ("carla2d", 0.1),
+        ("atl_v2_highway_mix", 0.13),
+        ("farzad_overpass_vehicle_boxonly", 0.1),
+        ("carla2d", 0.13),
         ("pandaset", 0.1),
         ("traffic_videos", 0.05),
     )

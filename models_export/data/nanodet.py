@@ -25,10 +25,12 @@ from service.nets.pack import session_options
 WEIGHTS = "teacher_nanodet_g_416.onnx"
 SIDE_PX = 416
 STRIDES = (8, 16, 32)
+CREDIT = "NanoDet-g, COCO, Apache-2.0"
 COCO_CLASSES, COCO_VEHICLES = 80, (2, 5, 7)
 """Cars, buses and trucks."""
-_MEAN_BGR = np.array([103.53, 116.28, 123.675], np.float32)
-_STD_BGR = np.array([57.375, 57.12, 58.395], np.float32)
+MEAN_BGR = np.array([103.53, 116.28, 123.675], np.float32)
+STD_BGR = np.array([57.375, 57.12, 58.395], np.float32)
+"""Of the pixels, grey levels: it sees (x - mean) / deviation."""
 SPEC = DetectorSpec(
     classes=("vehicle",),
     strides=STRIDES,
@@ -59,7 +61,7 @@ class NanoDet:
         results = []
         for image in images:
             (batch,) = SPEC.fit.batches([image])
-            pixels = ((batch.pixels[..., ::-1] - _MEAN_BGR) / _STD_BGR).transpose(0, 3, 1, 2)
+            pixels = ((batch.pixels[..., ::-1] - MEAN_BGR) / STD_BGR).transpose(0, 3, 1, 2)
             outputs = self.session.run(None, {self.session.get_inputs()[0].name: np.ascontiguousarray(pixels)})
             found = suppress(decode_heads(in_order(outputs), SPEC, score_threshold), nms_iou)
             results.append(Detections(batch.placements[0].to_image(found.xyxy_px), found.score, found.cls))

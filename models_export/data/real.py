@@ -7,6 +7,7 @@ from pathlib import Path
 
 from models_export.data import carla2d, pandaset_samples, roadside_train, traffic_videos
 from models_export.data.detection import DetectionSample, Labels, VehicleSample
+from models_export.data.nanodet import CREDIT
 from models_export.data.teacher import AgreeConfig, agreed, read_candidates
 
 ATTRIBUTIONS = (
@@ -55,7 +56,7 @@ class RealData:
 
     def credits(self) -> tuple[str, ...]:
         """For checkpoint and manifest: sources and licences, the teacher's too where one had a part in it."""
-        return (*ATTRIBUTIONS, *(["teacher: NanoDet-g, COCO, Apache-2.0"] if self.taught else []))
+        return (*ATTRIBUTIONS, *([f"teacher: {CREDIT}"] if self.taught else []))
 
     def _taught(self, roadside: Path) -> dict[str, Labels]:
         """By picture, what the teacher adds to the labels; labels of videos are all the teacher's."""

@@ -7,6 +7,7 @@ data: it gets them from one batch, and the scale and shift under which it gives 
 from __future__ import annotations
 
 import json
+from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,16 +37,31 @@ def load_exported(task: Task, path: Path) -> None:
     which nothing but zeros is left never learned and would never learn; it keeps its new random weights. Raises InputError when
     the file is no ONNX network or not one of this kind.
     """
-    model = _read(path)
+    model = read_model(path)
     try:
-        folded = _fill(task.net, _values(model.graph))
+        start_from(task, _values(model.graph))
     except (KeyError, ValueError) as error:
         raise InputError(
             f"holds no weights of this network: {error}", field=str(path), remedy="Give the file of its role in a pack."
         ) from error
     take_priors(task, _metadata(model))
+
+
+def start_from(task: Task, values: Mapping[str, Array], new: Container[str] = ()) -> None:
+    """Put weights, and the biases that are their norms' folded shifts, into ``task.net``, whose norms get their statistics from
+    a batch of the task.
+
+    values: by parameter; the shift of a convolution with a norm under ``<weight>_bias``. new: layers that keep their new
+    weights. Raises KeyError for a parameter that is not there, ValueError for one of another shape.
+    """
+    folded = _fill(task.net, values, new)
     indices = np.linspace(0, len(task) - 1, min(len(task), _CALIBRATION_ITEMS)).astype(np.int64)
     _unfold(task, folded, task.batch(indices, np.random.default_rng(0)))
+
+
+def is_ours(path: Path) -> bool:
+    """Whether an ONNX file is a network of a pack. Raises InputError when it cannot be read."""
+    return bool(_metadata(read_model(path)))
 
 
 def provenance(path: Path) -> dict[str, Any] | None:
@@ -67,7 +83,8 @@ def training_of(manifest: Manifest, name: str) -> dict[str, Any]:
     }
 
 
-def _read(path: Path) -> onnx.ModelProto:
+def read_model(path: Path) -> onnx.ModelProto:
+    """An ONNX file. Raises InputError when there is none."""
     try:
         return onnx.load(path)
     except OSError as error:
@@ -102,15 +119,12 @@ def _values(graph: onnx.GraphProto) -> dict[str, Array]:
 
 
 @torch.no_grad()
-def _fill(net: nn.Module, values: dict[str, Array]) -> dict[nn.BatchNorm2d, Tensor | None]:
-    """Weights of convolutions and linear layers; returns each norm's folded shift, None behind one that starts anew.
-
-    Raises KeyError for a parameter that is not there, ValueError for one of another shape.
-    """
+def _fill(net: nn.Module, values: Mapping[str, Array], new: Container[str]) -> dict[nn.BatchNorm2d, Tensor | None]:
+    """Weights of convolutions and linear layers; returns each norm's folded shift, None behind one that starts anew."""
     norms = _norms(net)
     folded: dict[nn.BatchNorm2d, Tensor | None] = {}
     for name, module in net.named_modules():
-        if not isinstance(module, nn.Conv2d | nn.Linear):
+        if name in new or not isinstance(module, nn.Conv2d | nn.Linear):
             continue
         weight = _tensor(values, f"{name}.weight", module.weight)
         norm = norms.get(name)
@@ -137,7 +151,7 @@ def _norms(net: nn.Module) -> dict[str, nn.BatchNorm2d]:
     return found
 
 
-def _tensor(values: dict[str, Array], name: str, like: Tensor) -> Tensor:
+def _tensor(values: Mapping[str, Array], name: str, like: Tensor) -> Tensor:
     value = torch.tensor(values[name], dtype=like.dtype)
     if value.shape != like.shape:
         raise ValueError(f"{name} is {tuple(value.shape)}, not {tuple(like.shape)}")

@@ -25,7 +25,7 @@ from service.pipeline import Pipeline
 
 def small_recipe() -> PackRecipe:
     recipe = edge_recipe(
-        DetectorConfig(channels=(8, 16, 24, 32), residuals=(1, 1, 0)),
+        DetectorConfig(width=8, blocks=(1, 1, 1, 1), neck=16),
         MultibinConfig(crop_px=32, channels=(8, 16, 16), residuals=(1, 1)),
         DepthConfig(stem=(8, 16, 16), width=32, blocks=1, heads=2, decoder=8),
     )

@@ -21,7 +21,7 @@ from service.errors import PackError
 from service.nets.detector import Detector
 from service.nets.pack import load_pack, open_network
 
-DETECTOR = DetectorConfig(channels=(8, 16, 24, 32), residuals=(1, 1, 0))
+DETECTOR = DetectorConfig(width=8, blocks=(1, 1, 1, 1), neck=16)
 METADATA = {
     "classes": list(DETECTOR.classes),
     "strides": list(DETECTOR.strides),

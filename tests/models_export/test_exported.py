@@ -20,7 +20,7 @@ from models_export.train.exported import load_exported, provenance
 from service.errors import InputError
 from service.nets.pack import MODELS_DIR
 
-CONFIG = DetectorConfig(channels=(8, 16, 24, 32), residuals=(1, 1, 0))
+CONFIG = DetectorConfig(width=8, blocks=(1, 1, 1, 1), neck=16)
 HEADS = ("p8", "p16", "p32")
 ANCHORS = tuple(tuple((8.0 * (3 * s + a + 1), 6.0 * (3 * s + a + 1)) for a in range(3)) for s in range(3))
 
@@ -76,13 +76,13 @@ def test_the_priors_that_the_weights_are_bound_to_come_along(toy_samples: list[S
 
 def test_a_convolution_of_zeros_starts_anew_and_learns(toy_samples: list[Sample], tmp_path: Path) -> None:
     trained = _trained(toy_samples)
-    dead = trained.net.stage8[1].body[1]
+    dead = trained.net.stage8.inner[0].second
     for values in (dead[0].weight, dead[1].bias, dead[1].running_mean):
         nn.init.zeros_(values)
     path = _file(trained, tmp_path / "detector.onnx", int8=False)
     task = DetectorTask(toy_samples, CONFIG)
     load_exported(task, path)
-    block = task.net.stage8[1].body[1]
+    block = task.net.stage8.inner[0].second
     task.loss(task.net, task.batch(np.arange(4), np.random.default_rng(0)))["total"].backward()
     assert block[0].weight.any()
     assert block[0].weight.grad.any()
@@ -90,10 +90,10 @@ def test_a_convolution_of_zeros_starts_anew_and_learns(toy_samples: list[Sample]
 
 def test_a_file_that_does_not_fit_is_refused(toy_samples: list[Sample], tmp_path: Path) -> None:
     path = _file(_trained(toy_samples), tmp_path / "detector.onnx", int8=False)
-    wider = DetectorTask(toy_samples, DetectorConfig(channels=(8, 16, 24, 48), residuals=(1, 1, 0)))
+    wider = DetectorTask(toy_samples, DetectorConfig(width=8, blocks=(1, 1, 1, 1), neck=24))
     with pytest.raises(InputError, match="no weights of this network"):
         load_exported(wider, path)
-    deeper = DetectorTask(toy_samples, DetectorConfig(channels=(8, 16, 24, 32), residuals=(2, 1, 0)))
+    deeper = DetectorTask(toy_samples, DetectorConfig(width=8, blocks=(1, 2, 1, 1), neck=16))
     with pytest.raises(InputError, match="stage8"):
         load_exported(deeper, path)
     path.write_bytes(b"no network")

@@ -62,7 +62,7 @@ def test_folding_the_pooling_changes_no_output() -> None:
 
 
 def test_networks_are_small() -> None:
-    assert parameter_count(EdgeDetector(CONFIG)) < 2e6
+    assert parameter_count(EdgeDetector(CONFIG)) < 4e6
     assert parameter_count(EdgeMultibin(MultibinConfig())) < 4e6
     assert parameter_count(EdgeDepth(DepthConfig())) < 3e6
 

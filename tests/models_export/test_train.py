@@ -28,7 +28,7 @@ from models_export.train.validation import Validation
 from service.errors import InputError
 
 SHORT = TrainConfig(steps=60, batch_size=4, learning_rate=3e-3, warmup_steps=5, ema_decay=0.9, amp=False, checkpoint_every=20)
-SMALL_DETECTOR = DetectorConfig(channels=(8, 16, 24, 32), residuals=(1, 1, 0))
+SMALL_DETECTOR = DetectorConfig(width=8, blocks=(1, 1, 1, 1), neck=16)
 SMALL_DEPTH = DepthConfig(stem=(8, 16, 16), width=32, blocks=1, heads=2, decoder=8)
 SMALL_HEAD = MultibinConfig(crop_px=32, channels=(8, 16, 16), residuals=(1, 1), squeezed=16, dropout=0.1)
 
