@@ -25,7 +25,7 @@ def edge_recipe(
     """The pack as it is shipped, or with networks of other shapes."""
     return PackRecipe(
         name="edge",
-        version="5",
+        version="6",
         networks=(
             _detector(detector or DetectorConfig()),
             _multibin(multibin or MultibinConfig()),
@@ -41,7 +41,7 @@ def _detector(config: DetectorConfig) -> NetworkRecipe:
         config=config,
         build=EdgeDetector,
         task=DetectorTask,
-        training=TrainConfig(steps=12000, batch_size=16),
+        training=TrainConfig(steps=12000, batch_size=24, learning_rate=6e-4, ema_decay=0.999),
         outputs=("p8", "p16", "p32"),
         metadata=detector_metadata,
         load_foreign=load_nanodet,

@@ -73,7 +73,8 @@ class EdgeDetector(nn.Module):
         self.config = config
         width, neck = config.width, config.neck
         self.normalise = Normalise()
-        self.stem = conv(3, width, 7, 4)
+        self.stem = conv(3, width, 3, 2)
+        self.pool = nn.MaxPool2d(3, 2, 1)
         self.stage4, self.stage8, self.stage16, self.stage32 = (
             PartialStage(width * 2**level, blocks, 1 if level == 0 else 2) for level, blocks in enumerate(config.blocks)
         )
@@ -87,7 +88,7 @@ class EdgeDetector(nn.Module):
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Heads at strides 8, 16, 32; H and W are multiples of 32."""
-        f8 = self.stage8(self.stage4(self.stem(self.normalise(images))))
+        f8 = self.stage8(self.stage4(self.pool(self.stem(self.normalise(images)))))
         f16 = self.stage16(f8)
         p32 = self.lateral32(self.stage32(f16))
         p16 = self.lateral16(f16) + self.up(p32)

@@ -1,8 +1,7 @@
 """Start the edge detector from NanoDet-g, a public detector of COCO's 80 classes (weights: Apache-2.0).
 
-Backbone, neck and the hidden maps of the heads are NanoDet-g's; what the heads say of anchors is new. Some things differ, and
-are learned again: ReLU for LeakyReLU (0.1), nearest for bilinear upsampling, zero padding around pixels of another mean, and
-one convolution of stride 4 for the first one, of stride 2, and the maximum of 3x3 behind it (in int8 a tenth of the time).
+Backbone, neck and the hidden maps of the heads are NanoDet-g's; what the heads say of anchors is new. Three things differ, and
+are learned again: ReLU for LeakyReLU (0.1), nearest for bilinear upsampling, and zero padding around pixels of another mean.
 """
 
 from __future__ import annotations
@@ -56,20 +55,11 @@ def nanodet_values(graph: onnx.GraphProto, config: DetectorConfig) -> dict[str, 
     for name, node in zip(names, convolutions, strict=True):
         if name is not None:
             values[f"{name}.weight"], values[f"{name}.weight_bias"] = (stored[entry] for entry in node.input[1:3])
-    pixels, shift = _with_pool(values["stem.0.weight"]), values["stem.0.weight_bias"]
+    pixels, shift = values["stem.0.weight"], values["stem.0.weight_bias"]
     # (x - mean) / std of x = (n + offset) / scale, channels turned around.
     values["stem.0.weight"] = (pixels / (STD_BGR.reshape(1, 3, 1, 1) * PIXEL_SCALE))[:, ::-1].copy()
     values["stem.0.weight_bias"] = shift + (pixels.sum((2, 3)) * ((PIXEL_OFFSET / PIXEL_SCALE - MEAN_BGR) / STD_BGR)).sum(1)
     return values
-
-
-def _with_pool(weight: Array) -> Array:
-    """Kernels (C, 3, 7, 7) of stride 4 that give the mean of what kernels (C, 3, 3, 3) of stride 2 give in a 3x3 window."""
-    whole = np.zeros((*weight.shape[:2], 7, 7))
-    for row in range(0, 5, 2):
-        for column in range(0, 5, 2):
-            whole[:, :, row : row + 3, column : column + 3] += weight / 9
-    return whole
 
 
 def _names(config: DetectorConfig) -> Iterator[str | None]:

@@ -94,7 +94,7 @@ def test_a_checkpoint_holds_its_configuration(toy_samples: list[Sample], tmp_pat
     task = task_of("detector", toy_samples)
     trained = fit(task, replace(SHORT, steps=2), tmp_path)
     loaded, state = load_averaged(tmp_path / "detector.pt", task_of("detector", toy_samples).net)
-    assert state["task"]["net"]["channels"] == SMALL_DETECTOR.channels
+    assert state["task"]["net"]["width"] == SMALL_DETECTOR.width
     for ours, theirs in zip(loaded.state_dict().values(), trained.state_dict().values(), strict=True):
         assert torch.equal(ours, theirs)
 
