@@ -90,17 +90,14 @@ def second_looks(
     A head reads best what its crop shows in the middle. Where an edge that it read lies farther from the detector's than
     ``least_shift`` of the box's longer side, a second crop is cut around the outline.
     """
-    none = np.zeros(0, np.int64), Crops(np.zeros((0, crop_px, crop_px, 3), np.uint8), np.zeros((0, 3), np.int64))
-    if estimates.xyxy_px is None or not len(estimates.alpha):
-        return none
     index = np.repeat(np.arange(len(stills)), [len(own) for own in found])
     boxes = np.concatenate(_in_image(stills, found))
+    # A head that reads no outline has nothing against the detector's box.
+    outlines = boxes if estimates.xyxy_px is None else estimates.xyxy_px
     side = (boxes[:, 2:] - boxes[:, :2]).max(1)
-    shift = np.abs(estimates.xyxy_px - boxes).max(1) / np.maximum(side, 1.0)
+    shift = np.abs(outlines - boxes).max(1) / np.maximum(side, 1.0)
     again = np.flatnonzero((shift > least_shift) & (shift < _MOST_SHIFT))
-    if not len(again):
-        return none
-    crops = [cut_crops(still.image, estimates.xyxy_px[again[index[again] == row]], crop_px) for row, still in enumerate(stills)]
+    crops = [cut_crops(still.image, outlines[again[index[again] == row]], crop_px) for row, still in enumerate(stills)]
     return again, Crops.concatenate(crops)
 
 
