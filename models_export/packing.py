@@ -18,9 +18,9 @@ from models_export.data.samples import Sample, split_scenes
 from models_export.data.vehicles import vehicles_of
 from models_export.export import Exported, fixed_batch, to_onnx, with_metadata, write_pack
 from models_export.half import to_half
+from models_export.int8.quantize import quantize
 from models_export.metadata import UNMEASURED
 from models_export.nets.blocks import parameter_count
-from models_export.quantize import quantize
 from models_export.recipe import NetworkRecipe, PackRecipe, Precision, resolved_config
 from models_export.train.checkpoint import load_averaged, read_checkpoint
 from models_export.train.exported import training_of

@@ -12,10 +12,10 @@ import torch
 
 from models_export.export import Exported, fixed_batch, to_onnx, with_metadata, write_pack
 from models_export.half import to_half
+from models_export.int8.quantize import quantize
 from models_export.nets.depth import DepthConfig, EdgeDepth
 from models_export.nets.detector import DetectorConfig, EdgeDetector
 from models_export.nets.multibin import EdgeMultibin, MultibinConfig
-from models_export.quantize import quantize
 from models_export.verify import parity, require_parity
 from service.errors import PackError
 from service.nets.detector import Detector

@@ -12,9 +12,9 @@ from torch import nn
 
 from models_export.data.samples import Sample
 from models_export.export import to_onnx, with_metadata
+from models_export.int8.quantize import quantize
 from models_export.metadata import detector_metadata
 from models_export.nets.detector import DetectorConfig
-from models_export.quantize import quantize
 from models_export.train.detector import DetectorTask
 from models_export.train.exported import load_exported, provenance
 from service.errors import InputError

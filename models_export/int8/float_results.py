@@ -1,0 +1,54 @@
+"""The last layers of a quantized network: int8 products whose sums come out as floats, unrounded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnx import numpy_helper
+
+from models_export.int8.graph_writer import GraphWriter
+
+_INT8_MOST = 127
+
+
+def multiply_in_int8(graph: onnx.GraphProto, outputs: Sequence[str]) -> None:
+    """Let outputs that are 1x1 convolutions of quantized maps multiply int8 by int8; changes the graph.
+
+    A result that feeds an exponential or a sigmoid must not be rounded; but the layer's input is int8 already, and weights
+    lose little. As a matrix product of cells by channels ONNX Runtime does that without turning the map into floats and into
+    another order first. Other outputs stay as they are.
+    """
+    constants = {entry.name: numpy_helper.to_array(entry) for entry in graph.initializer}
+    makers = {name: node for node in graph.node for name in node.output}
+    for output in outputs:
+        layer = makers[output]
+        read = makers.get(layer.input[0])
+        weight = constants.get(layer.input[1]) if len(layer.input) > 1 else None
+        if layer.op_type != "Conv" or read is None or read.op_type != "DequantizeLinear" or weight is None:
+            continue
+        if weight.shape[2:] == (1, 1):
+            _as_product(graph, layer, weight, output)
+
+
+def _as_product(graph: onnx.GraphProto, layer: onnx.NodeProto, weight: NDArray[np.float32], output: str) -> None:
+    """Put the product of cells and weights (C_out, C_in, 1, 1) in a layer's place."""
+    added = GraphWriter(graph, output)
+    read, name, *bias = layer.input
+    scale = np.maximum(np.abs(weight).max((1, 2, 3)), np.finfo(np.float32).tiny) / np.float32(_INT8_MOST)
+    # Named and shaped as the quantizer leaves all weights: a training can start from them.
+    stored = added.constant(np.rint(weight / scale[:, None, None, None]).astype(np.int8), f"{name}_quantized")
+    added.constant(scale, f"{name}_scale")
+    table = added.before(layer, "Squeeze", [stored, added.constant(np.array([2, 3], np.int64))])
+    columns = added.before(layer, "Transpose", [table], perm=(1, 0))
+    zero = added.constant(np.zeros(len(scale), np.int8))
+    factors = added.before(layer, "DequantizeLinear", [columns, f"{name}_scale", zero], axis=1)
+    cells = added.before(layer, "Transpose", [read], perm=(0, 2, 3, 1))
+    product = added.before(layer, "MatMul", [cells, factors])
+    if bias:
+        product = added.before(layer, "Add", [product, *bias])
+    added.before(layer, "Transpose", [product], output, perm=(0, 3, 1, 2))
+    graph.node.remove(layer)
+    graph.initializer.remove(next(entry for entry in graph.initializer if entry.name == name))
