@@ -49,6 +49,10 @@ notes = Console(stderr=True, soft_wrap=True)
 
 PackOption = Annotated[str, typer.Option(help="Pack: a shipped one's name, or a folder.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+WidthOption = Annotated[
+    int | None,
+    typer.Option("--detector-width", min=64, help="Bring all pictures to this width for the detector, px."),
+]
 
 
 @app.command("clip")
@@ -63,9 +67,10 @@ def clip_command(
 
 
 @app.command("roadside")
-def roadside_command(pack: PackOption = "edge", as_json: JsonOption = False) -> None:
+def roadside_command(pack: PackOption = "edge", detector_width: WidthOption = None, as_json: JsonOption = False) -> None:
     """Three real roadside cameras against a LiDAR system's tracks (needs the recording)."""
-    _report("roadside", pack, lambda pipeline: score_roadside(pipeline, open_roadside_clip()), as_json)
+    settings = PipelineSettings(detector_width=detector_width)
+    _report("roadside", pack, lambda pipeline: score_roadside(pipeline, open_roadside_clip()), as_json, settings)
 
 
 @app.command("carla2d")
@@ -164,12 +169,13 @@ def scenes_command(
     cameras: Annotated[int | None, typer.Option(min=1, help="Use only the first N; each count if left out.")] = None,
     method: Annotated[Literal["map", "paper"], typer.Option(help="How boxes are lifted and fused.")] = "map",
     hard_mode: Annotated[HardMode, typer.Option(help="Where the pack's depth-guided detector adds boxes.")] = "auto",
+    detector_width: WidthOption = None,
     as_json: JsonOption = False,
     plots: Annotated[Path | None, typer.Option(help="Folder for precision-recall curves and RMSE bars as PNG.")] = None,
 ) -> None:
     """Fused and single-camera boxes on scenes with exact truth: AP, position errors, tracking, by difficulty."""
     with _errors_named():
-        settings = replace(settings_of(method), hard_mode=hard_mode)
+        settings = replace(settings_of(method), hard_mode=hard_mode, detector_width=detector_width)
         sets = open_scene_sets(dataset)
         counts = _camera_counts(sets, cameras)
         loaded = load_pack(pack)
@@ -183,6 +189,7 @@ def scenes_command(
         notes.print(f"[yellow]{count} objects of the unknown class '{escape(name)}' skipped.[/yellow]")
     if as_json:
         about = {"dataset": str(dataset), "scenes": len(sets.scenes), "pack": pack, "method": method, "hard_mode": hard_mode}
+        about |= {} if detector_width is None else {"detector_width": detector_width}
         typer.echo(json.dumps({**about, "rules": RULES, "machine": describe_machine(), "difficulties": figures}, indent=1))
         return
     title = f"{dataset.name}: {len(sets.scenes)} scenes, pack {pack}, method {method}, hard mode {hard_mode}"
@@ -210,9 +217,9 @@ def _errors_named() -> Iterator[None]:
         raise typer.Exit(2) from None
 
 
-def _report(name: str, pack: str, score: Any, as_json: bool) -> None:
+def _report(name: str, pack: str, score: Any, as_json: bool, settings: PipelineSettings | None = None) -> None:
     with _errors_named():
-        result = score(Pipeline(load_pack(pack), PipelineSettings()))
+        result = score(Pipeline(load_pack(pack), settings))
     _print_figures(name, pack, result, as_json)
 
 

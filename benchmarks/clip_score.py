@@ -47,7 +47,7 @@ def score_roadside(pipeline: Pipeline, clip: RoadsideClip) -> dict[str, Any]:
     for step in ROADSIDE_STEPS:
         frames = {camera.id: clip.frame(camera.id, step) for camera in clip.site.cameras}
         for camera in clip.site.cameras:
-            image = decode(frames[camera.id], camera, pipeline.detector.spec.max_width)
+            image = pipeline.for_detector(decode(frames[camera.id], camera, pipeline.detector_width))
             found = pipeline.detector.detect([image], score_threshold=pipeline.settings.score_threshold)[0]
             scale = np.array([camera.width / image.shape[1], camera.height / image.shape[0]] * 2)
             hits = _greedy_hits(found.xyxy_px * scale, clip.reference_2d(camera.id, step))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 
 DEAR = 1.08
@@ -12,7 +13,9 @@ MOST_LOAD = 0.75
 """Of all processes' time, counted in whole sets. Beyond it sets that are divided, whose processes wait for one another, would
 fall behind: measured on two cores (docs: operations)."""
 _NEW = 0.1
-"""Weight of a new set in the running means."""
+"""Weight of a new set in the running mean of what sets cost."""
+_ARRIVALS = 16
+"""Sets whose arrivals say how often they come: a pause is forgotten when so many have come after it."""
 
 
 class Division:
@@ -22,8 +25,7 @@ class Division:
         self._processes = processes
         self._clock = clock
         self._lock = threading.Lock()
-        self._last_s: float | None = None
-        self._interval_s = 0.0
+        self._arrivals: deque[float] = deque(maxlen=_ARRIVALS + 1)
         self._cost_s = 0.0
 
     @property
@@ -33,22 +35,19 @@ class Division:
 
     def arrived(self) -> None:
         """A set is there to be run."""
-        now = self._clock()
         with self._lock:
-            if self._last_s is not None:
-                self._interval_s = _mean(self._interval_s, now - self._last_s)
-            self._last_s = now
+            self._arrivals.append(self._clock())
 
     def took(self, seconds: float, *, divided: bool) -> None:
         """A set took so long, in all processes that worked at it together."""
         with self._lock:
-            self._cost_s = _mean(self._cost_s, seconds / DEAR if divided else seconds)
+            whole = seconds / DEAR if divided else seconds
+            self._cost_s += _NEW * (whole - self._cost_s) if self._cost_s else whole
 
     def pays(self) -> bool:
         """Whether all sets could be divided, as often as they come, and still be run in time."""
         with self._lock:
-            return self._cost_s <= MOST_LOAD * self._processes * self._interval_s
-
-
-def _mean(old: float, new: float) -> float:
-    return new if not old else old + _NEW * (new - old)
+            if len(self._arrivals) < 2:
+                return True
+            interval_s = (self._arrivals[-1] - self._arrivals[0]) / (len(self._arrivals) - 1)
+            return self._cost_s <= MOST_LOAD * self._processes * interval_s

@@ -26,6 +26,9 @@ MAX_JPEG_SCANS = 100
 DECODE_SLACK_PX = 32
 """A scaled picture may be this much narrower than asked for: 1284 px at 4/8 are 642 where a network takes 672."""
 
+WHOLE_FACTOR_LEAVES = 0.9
+"""A picture that is reduced by a whole factor may come out this much narrower than it could be."""
+
 _SCALE_DENOMINATOR = 8
 _JPEG_START = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
@@ -169,13 +172,27 @@ def decode(data: bytes, camera: Camera, max_width: int) -> UInt8Image:
 
 
 def reduced(image: UInt8Image, max_width: int) -> UInt8Image:
-    """An image (H, W, 3) at most ``max_width`` px wide, by a whole factor; the same one where it is narrow enough."""
+    """An image (H, W, 3) at most ``max_width`` px wide; the same one where it is narrow enough.
+
+    By a whole factor, which is quick, unless that leaves less than ``WHOLE_FACTOR_LEAVES`` of ``max_width``.
+    """
     height, width = image.shape[:2]
     factor = -(-width // max_width)
     if factor == 1:
         return image
-    size = (max(width // factor, 1), max(round(height / factor), 1))
+    size = (width // factor, max(round(height / factor), 1))
+    if size[0] < WHOLE_FACTOR_LEAVES * max_width:
+        size = (max_width, max(round(height * max_width / width), 1))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def resized(image: UInt8Image, width: int) -> UInt8Image:
+    """An image (H, W, 3) at a width, px, larger or smaller; the same one where it has it."""
+    if image.shape[1] == width:
+        return image
+    size = (width, max(round(image.shape[0] * width / image.shape[1]), 1))
+    interpolation = cv2.INTER_AREA if image.shape[1] > width else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(image, size, interpolation=interpolation), dtype=np.uint8)
 
 
 def _scaled_size(width: int, height: int, max_width: int) -> tuple[int, int]:

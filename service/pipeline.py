@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from service.depth_scale import DepthReadings, DepthScale, DepthScales, read_boxes
 from service.errors import FrameError
-from service.frames import FrameSet, decode, reduced
+from service.frames import FrameSet, decode, reduced, resized
 from service.fusion import CameraParts, FusedBoxes, FusionSettings, fuse
 from service.geometry.boxes import Boxes
-from service.geometry.camera import Camera
+from service.geometry.camera import Camera, UInt8Image
 from service.guidance import Guidance, GuidanceSettings, HardMode, View
 from service.lifting import LiftSettings, lift_with_terms
 from service.measurements import Measurements
@@ -55,6 +55,10 @@ class PipelineSettings:
     """Whether the depth-guided detector adds to what was lifted: in cameras whose view is hard, in all, or in none."""
     score_threshold: float = SCORE_THRESHOLD
     """2D detections of a lower score are dropped."""
+    detector_width: int | None = None
+    """All pictures are brought to this width for the detector and the depth net, px; None: only those that are wider than the
+    pack says, to that. More finds smaller vehicles, also where it enlarges, in time that grows with its square (docs:
+    networks)."""
     nms_iou: float = NMS_IOU
     """2D boxes that overlap a better one by more are dropped."""
     refine_shift: float = 0.05
@@ -113,6 +117,16 @@ class Pipeline:
         # Whole frame sets run side by side; threads inside OpenCV would only fight them for the same cores.
         cv2.setNumThreads(1)
 
+    @property
+    def detector_width(self) -> int:
+        """Width of the widest picture that the detector sees, px."""
+        return self.settings.detector_width or self.detector.spec.max_width
+
+    def for_detector(self, image: UInt8Image) -> UInt8Image:
+        """A picture (H, W, 3) at the size at which the detector sees it."""
+        width = self.settings.detector_width
+        return reduced(image, self.detector_width) if width is None else resized(image, width)
+
     def warm_up(self) -> None:
         """Run every network twice on four frames of the paper's size full of vehicles.
 
@@ -120,7 +134,7 @@ class Pipeline:
         sets would grow with its first whole ones, perhaps hours later. Twice, for at its second run of a shape ONNX Runtime
         takes one more block, for all results in between.
         """
-        width, height = canvas_size(self.detector.spec.max_width, 192)
+        width, height = canvas_size(self.detector_width, 192)
         images = [np.full((height, width, 3), 114, np.uint8)] * 4
         boxes = np.tile([0.0, 0.0, 20.0, 20.0], (_WARM_UP_CROPS, 1))
         crops = cut_crops(images[0], boxes, self.multibin.spec.crop_px)
@@ -246,8 +260,7 @@ class Pipeline:
     def decode(self, frame_set: FrameSet) -> tuple[list[Still], dict[str, FrameError]]:
         """The first step alone: every frame at the sizes that the networks want, and the cameras whose frames are damaged."""
         stills, failed = [], {}
-        small_width = self.detector.spec.max_width
-        crop_width = max(self.multibin.spec.max_width or 0, small_width)
+        crop_width = max(self.multibin.spec.max_width or 0, self.detector_width)
         width = max(crop_width, self.guidance.max_width or 0) if self.guidance is not None else crop_width
         for frame in frame_set.frames:
             camera = frame_set.site.camera(frame.camera_id)
@@ -256,7 +269,7 @@ class Pipeline:
             except FrameError as error:
                 failed[camera.id] = error
                 continue
-            stills.append(Still(camera, reduced(image, crop_width), reduced(image, small_width), image))
+            stills.append(Still(camera, reduced(image, crop_width), self.for_detector(image), image))
         return stills, failed
 
     def _detect(self, canvases: Canvases) -> list[Detections]:

@@ -21,7 +21,7 @@ Load = Callable[[Settings], FrameSetRunner]
 
 def load_pipeline(settings: Settings) -> Pipeline:
     """The service's own pipeline on the pack that the settings name. Raises PackError or InputError."""
-    options = PipelineSettings(hard_mode=settings.hard_mode)
+    options = PipelineSettings(hard_mode=settings.hard_mode, detector_width=settings.detector_width)
     if (threshold := settings.score_threshold) is not None:
         options = replace(options, score_threshold=threshold, min_fused_score=threshold)
     pack = load_pack(settings.pack, provider=settings.provider, intra_op_threads=settings.intra_op_threads)

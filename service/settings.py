@@ -69,6 +69,9 @@ class Settings(BaseSettings):
     """Threads that may hang while others take their place. One more, and the service is not ready until one comes back."""
     score_threshold: Annotated[float, Field(ge=0, le=1)] | None = None
     """Detections and boxes of a lower score are left out. Unset: the pipeline's own thresholds."""
+    detector_width: Annotated[int, Field(ge=64, le=4096)] | None = None
+    """All pictures are brought to this width for the detector and the depth net, px. Unset: only those that are wider than the
+    pack says, to that. More finds smaller vehicles, also where it enlarges, in time that grows with its square."""
     hard_mode: Literal["auto", "always", "never"] = "auto"
     """Where the pack's depth-guided detector adds boxes: in cameras whose view is dark, of little contrast or crowded, in
     all, or in none. ``always`` needs a pack that has the network; with one that has not, ``auto`` is ``never``."""

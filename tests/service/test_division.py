@@ -42,6 +42,24 @@ def test_it_follows_a_machine_that_slows_down() -> None:
     assert not division.pays()
 
 
+@pytest.mark.parametrize("pause_s", [1.0, 3600.0])
+def test_however_long_a_pause_a_rush_after_it_is_soon_seen(pause_s: float) -> None:
+    now = 0.0
+    division = Division(2, lambda: now)
+    for _ in range(30):
+        division.arrived()
+        division.took(0.05, divided=False)
+        now += 0.02
+    assert not division.pays()
+    now += pause_s
+    division.arrived()
+    assert division.pays()
+    for _ in range(16):
+        now += 0.02
+        division.arrived()
+    assert not division.pays()
+
+
 def test_the_first_sets_are_divided_before_anything_is_known() -> None:
     division = Division(2)
     assert division.pays()

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.errors import FrameError, TooLargeError
-from service.frames import EncodedFrame, FrameLimits, FrameSet, check_frame, decode, decoded_size, read_header, reduced
+from service.frames import EncodedFrame, FrameLimits, FrameSet, check_frame, decode, decoded_size, read_header, reduced, resized
 from service.geometry.camera import Camera
 from service.site import Site
 
@@ -166,6 +166,21 @@ def test_a_reduced_picture_is_narrow_enough_and_keeps_its_mean(width: int, heigh
     assert small.shape[1] <= max_width
     if width <= max_width:
         assert small is image
+    else:
+        assert small.shape[1] >= min(0.9 * max_width, width)
+        assert abs(small.shape[0] - max(height * small.shape[1] / width, 1)) <= 1 + height / width
+
+
+@pytest.mark.parametrize("width", [16, 48, 64, 100])
+def test_a_resized_picture_has_the_width_and_shows_the_same(width: int) -> None:
+    ramp = np.repeat(np.arange(64, dtype=np.uint8)[None, :, None] * 3, 32, 0).repeat(3, 2)
+    image = resized(ramp, width)
+    assert image.shape == (round(32 * width / 64), width, 3)
+    u = (np.arange(width) + 0.5) * 64 / width - 0.5
+    inner = (u > 2) & (u < 61)
+    assert np.abs(image[5, inner, 0] - 3 * u[inner]).max() <= 1.5
+    if width == 64:
+        assert image is ramp
 
 
 def test_halving_is_a_mean_of_four() -> None:

@@ -104,6 +104,18 @@ def test_a_set_in_which_nothing_is_found_has_no_boxes() -> None:
     assert len(result.boxes) == 0
 
 
+@pytest.mark.parametrize("width", [512, 800])
+def test_the_same_vehicles_stand_in_the_same_places_at_another_width(pipeline: Pipeline, width: int) -> None:
+    other = Pipeline(load_pack("edge"), PipelineSettings(detector_width=width))
+    stills, _ = other.decode(frame_set(40))
+    assert {still.small.shape[1] for still in stills} == {width}
+    assert other.detector_width == width
+    ours, theirs = pipeline.run(frame_set(40)).boxes.center, other.run(frame_set(40)).boxes.center
+    apart = np.linalg.norm(ours[:, None, :2] - theirs[None, :, :2], axis=2)
+    assert np.median(apart.min(1)) < 0.3
+    assert (apart.min(1) < 1.0).mean() > 0.7
+
+
 def test_threads_do_not_disturb_each_other(pipeline: Pipeline) -> None:
     steps = list(range(0, 40, 5))
     alone = [pipeline.run(frame_set(step)).boxes.center for step in steps]
