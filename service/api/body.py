@@ -19,6 +19,7 @@ from service.errors import InputError, OverloadError, SlowSenderError, TooLargeE
 # It warns of every form that is none; the answer says so already, and no stranger must be able to fill the log.
 logging.getLogger("python_multipart").setLevel(logging.ERROR)
 
+_PIECE_BYTES = 2**18
 _FORM_REMEDY = "Send multipart/form-data with one file part a camera, for example: curl -F north=@north.jpg."
 
 
@@ -36,9 +37,23 @@ class Part:
 class _Body:
     """A body on its way in."""
 
-    data: bytearray = field(default_factory=bytearray)
+    pieces: list[bytearray] = field(default_factory=list)
+    """Of up to ``_PIECE_BYTES``: one block that grows for as long as bytes come would be moved from place to place, and leave
+    holes as large as itself."""
+    size: int = 0
     is_cut: bool = False
     """It had to make room: its bytes are gone, and its sender is told with the next ones."""
+
+    def append(self, chunk: bytes) -> None:
+        """More bytes; however few, they share a piece."""
+        if not self.pieces or len(self.pieces[-1]) + len(chunk) > _PIECE_BYTES:
+            self.pieces.append(bytearray())
+        self.pieces[-1] += chunk
+        self.size += len(chunk)
+
+    def cut(self) -> None:
+        """Let the bytes go."""
+        self.pieces, self.size, self.is_cut = [], 0, True
 
 
 class BodyRoom:
@@ -54,7 +69,7 @@ class BodyRoom:
     @property
     def held_bytes(self) -> int:
         """What all bodies take now."""
-        return sum(len(body.data) for body in self._bodies)
+        return sum(body.size for body in self._bodies)
 
     @contextmanager
     def receiving(self) -> Iterator[_Body]:
@@ -69,18 +84,17 @@ class BodyRoom:
     def add(self, body: _Body, chunk: bytes) -> None:
         """More bytes of a body. Raises OverloadError when it is the one that has to make room."""
         while not body.is_cut and self.held_bytes + len(chunk) > self._max_bytes:
-            longest = max(self._bodies, key=lambda other: len(other.data))
-            if len(longest.data) <= len(body.data) + len(chunk):
+            longest = max(self._bodies, key=lambda other: other.size)
+            if longest.size <= body.size + len(chunk):
                 longest = body
-            longest.data = bytearray()
-            longest.is_cut = True
+            longest.cut()
         self._require_kept(body)
-        body.data += chunk
+        body.append(chunk)
 
     def whole(self, body: _Body) -> bytes:
         """A body that has come to its end. Raises OverloadError when it had to make room meanwhile."""
         self._require_kept(body)
-        return bytes(body.data)
+        return b"".join(body.pieces)
 
     def _require_kept(self, body: _Body) -> None:
         if body.is_cut:
@@ -103,12 +117,12 @@ async def read_body(request: Request, max_bytes: int, limit_s: float, room: Body
         try:
             async with asyncio.timeout(limit_s):
                 async for chunk in request.stream():
-                    if len(body.data) + len(chunk) > max_bytes:
+                    if body.size + len(chunk) > max_bytes:
                         raise _too_long("more bytes", max_bytes)
                     room.add(body, chunk)
         except TimeoutError:
             raise SlowSenderError(
-                f"{len(body.data)} bytes came within {limit_s:g} s, and not the end.",
+                f"{body.size} bytes came within {limit_s:g} s, and not the end.",
                 field="body",
                 remedy="Send faster, compress the frames more, or raise QUADLIFT_BODY_RECEIVE_S.",
             ) from None

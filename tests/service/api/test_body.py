@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import sys
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from starlette.requests import Request
 from starlette.types import Message
 
@@ -73,3 +76,20 @@ def test_a_body_that_is_too_long_gives_its_room_back() -> None:
     with pytest.raises(TooLargeError):
         asyncio.run(received(room, b"a" * 60, b"b" * 60))
     assert room.held_bytes == 0
+
+
+@given(lengths=st.lists(st.sampled_from([1, 7, 65_536, 200_000, 262_144, 300_000]), min_size=1, max_size=12))
+def test_a_body_is_what_was_sent_however_it_was_cut(lengths: list[int]) -> None:
+    room = BodyRoom(10**7)
+    chunks = [bytes([number + 1]) * length for number, length in enumerate(lengths)]
+    assert asyncio.run(read_body(posted(*chunks), 10**7, 5.0, room)) == b"".join(chunks)
+    assert room.held_bytes == 0
+
+
+def test_the_smallest_chunks_take_no_more_room_than_large_ones() -> None:
+    room = BodyRoom(10**6)
+    with room.receiving() as body:
+        for _ in range(100_000):
+            room.add(body, b"x")
+        assert room.held_bytes == 100_000
+        assert sum(sys.getsizeof(piece) for piece in body.pieces) < 120_000
