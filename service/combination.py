@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from service.association import Index
+from service.confidence import mean_score
 from service.geometry.boxes import STATE_DIM, YAW, Boxes, box_states
 from service.geometry.transforms import Array, inverse_2x2, wrap_angle
 from service.joint import solve_jointly
@@ -14,7 +15,6 @@ from service.residuals import BoxProblem
 from service.solver import SolverSettings
 
 _DIMS = slice(3, 6)
-_MAX_SCORE = 1.0 - 1e-9
 
 
 def summable(boxes: Boxes, cluster: Index) -> Boxes:
@@ -60,7 +60,7 @@ def combine(boxes: Boxes, cluster: Index, terms: BoxProblem | None, settings: So
         center=fused[:, :3],
         dims_lwh=fused[:, _DIMS],
         yaw=wrap_angle(fused[:, YAW] + np.where(evidence < 0, np.pi, 0.0)),
-        score=1.0 - np.exp(np.bincount(cluster, np.log1p(-np.minimum(boxes.score, _MAX_SCORE)), rows)),
+        score=mean_score(boxes.score, cluster, rows),
         cls=_voted_class(boxes, cluster, rows),
         covariance=covariance,
         flip_log_odds=np.abs(evidence),

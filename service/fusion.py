@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from service.association import Index, best_of_duplicates, gated_assignment, mahalanobis_cost
 from service.combination import combine, summable
+from service.confidence import Confidence, evidence
 from service.geometry.boxes import Boxes
 from service.geometry.camera import Camera
 from service.geometry.transforms import Array, inverse_2x2
@@ -82,14 +83,10 @@ class FusionSettings:
     0.85 m off towards each other reach it."""
     duplicate_distance_m: float = 1.0
     """Centres nearer than this are one vehicle, metres."""
-    silence_ratio: float = 0.8
-    """How much likelier a camera is silent about a real vehicle in its full view than about a false alarm of another camera.
-    Near 1, for another vehicle may hide it."""
     view_range_m: float = 40.0
     """A camera is expected to report vehicles up to this distance, metres."""
-    doubt: float = 0.0
-    """How fast a score falls with what the covariance leaves open of the footprint: exp(-doubt (sigma along the length over the
-    length + sigma across over the width)). Boxes that are surely there but not surely *so* then come after those that are."""
+    confidence: Confidence = field(default_factory=Confidence)
+    """What makes a fused box's score."""
     solver: SolverSettings = field(default_factory=SolverSettings)
     """For vehicles of several cameras."""
 
@@ -105,8 +102,7 @@ def fuse(
 
     terms: what the N boxes were solved from (:func:`service.lifting.lift_with_terms`). With them a vehicle of several cameras
     is solved anew from everything that these saw; without, their boxes are combined by covariance, which is less exact.
-    Score: 1 - prod(1 - s) over the cameras that contributed (false alarms of different cameras rarely coincide); then each
-    camera that should see the vehicle and is silent multiplies the odds by ``silence_ratio``; then ``doubt`` lowers it.
+    Scores are the settings' ``confidence``.
     """
     settings = settings or FusionSettings()
     if len(boxes) == 0:
@@ -123,9 +119,8 @@ def fuse(
     fused, parts, cluster = _fuse_and_merge(single, owner, terms, cluster, settings)
     members = np.zeros((len(fused), len(cameras)), dtype=bool)
     members[parts.row, parts.camera] = True
-    score = _discounted(fused.score, _silences(fused, members, cameras, settings), settings.silence_ratio)
-    if settings.doubt:
-        score *= np.exp(-settings.doubt * footprint_doubt(fused))
+    silences = silent_cameras(fused, members, cameras, settings.view_range_m)
+    score = settings.confidence.of(evidence(fused, members.sum(1), silences))
     order = np.argsort(-score, kind="stable")
     rank = np.argsort(order)
     position = np.zeros(len(boxes), np.int64)
@@ -219,25 +214,8 @@ def _best_per_camera(boxes: Boxes, owner: Index, cluster: Index) -> Index:
     return best
 
 
-def _silences(fused: Boxes, members: NDArray[np.bool_], cameras: Sequence[Camera], settings: FusionSettings) -> Array:
-    """Cameras (M,) that have each box in full view, within range, and do not report it."""
-    silent = whole_in_view(fused, cameras, settings.view_range_m) & ~members
+def silent_cameras(fused: Boxes, members: NDArray[np.bool_], cameras: Sequence[Camera], range_m: float) -> Array:
+    """How many cameras (M,) have each box in full view, within range, and do not report it."""
+    silent = whole_in_view(fused, cameras, range_m) & ~members
     count: Array = silent.sum(1).astype(np.float64)
     return count
-
-
-def footprint_doubt(boxes: Boxes) -> Array:
-    """(M,) standard deviation of the centre along the length over the length, plus that across it over the width."""
-    heading = np.stack([np.cos(boxes.yaw), np.sin(boxes.yaw)], 1)
-    across = np.stack([-heading[:, 1], heading[:, 0]], 1)
-    place = boxes.covariance[:, :2, :2]
-    variances = [((place @ axis[..., None])[..., 0] * axis).sum(1) for axis in (heading, across)]
-    doubt: Array = sum(np.sqrt(variance) / boxes.dims_lwh[:, side] for side, variance in enumerate(variances))
-    return doubt
-
-
-def _discounted(score: Array, silences: Array, ratio: float) -> Array:
-    """Scores (M,) after ``silences`` (M,) likelihood ratios of ``ratio`` each: odds times ratio^silences."""
-    kept = score * ratio**silences
-    discounted: Array = kept / (kept + 1.0 - score)
-    return discounted

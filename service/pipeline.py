@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from service.confidence import Confidence
 from service.depth_scale import DepthReadings, DepthScale, DepthScales, read_boxes
 from service.errors import FrameError
 from service.frames import FrameSet, decode, reduced, resized
@@ -34,8 +35,9 @@ from service.sightings import Sightings
 from service.site import Site
 from service.solver import SolverSettings
 
-DOUBT = 2.0
-"""``FusionSettings.doubt`` of a pipeline, chosen on validation scenes (docs: fusion)."""
+CONFIDENCE = Confidence(offset=-4.5, score=1.1, doubt=-2.4, several=-0.85, silent=-0.55)
+"""``FusionSettings.confidence`` of a pipeline, fitted on validation scenes (docs: fusion): the score is then about the share of
+such boxes that overlap a vehicle by more than half."""
 HUBER_SIGMAS = 1.0
 """``LiftSettings.huber_sigmas`` of a pipeline: a network's outline of a vehicle that is partly hidden is a guess, and wrong
 guesses are far off (validation scenes; docs: lifting)."""
@@ -64,16 +66,12 @@ class PipelineSettings:
     refine_shift: float = 0.05
     """Vehicles are read a second time whose outline differs from the detected box by more of its longer side; 1: none are. On
     validation scenes these are 52 %; most of what reading all of them twice would gain (docs: networks)."""
-    min_fused_score: float = 0.3
+    min_fused_score: float = 0.2
     """Fused boxes of a lower score are dropped."""
-    max_position_sigma_m: float = 1.2
-    """Fused boxes whose place on the road is less certain (one sigma, both axes together) are dropped: mostly vehicles that one
-    camera alone sees, from far away, often beside their own box from the other cameras. ``per_camera`` has them. The paper's
-    method knows no such limit."""
     lift: LiftSettings = field(default_factory=lambda: LiftSettings(huber_sigmas=HUBER_SIGMAS, solver=SOLVER))
     """How exact the ground is, and for fusion the cameras, a site's own ``accuracy`` says."""
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
-    fusion: FusionSettings = field(default_factory=lambda: FusionSettings(doubt=DOUBT, solver=SOLVER))
+    fusion: FusionSettings = field(default_factory=lambda: FusionSettings(confidence=CONFIDENCE, solver=SOLVER))
     paper_fusion: PaperFusionSettings = field(default_factory=PaperFusionSettings)
 
 
@@ -200,7 +198,7 @@ class Pipeline:
         before = timing.pop("total")
         with _timed(timing, "fuse"):
             fused = self._fuse(sightings, site)
-            keep = self._reported(fused.boxes)
+            keep = fused.boxes.score >= self.settings.min_fused_score
         timing["total"] = before + 1e3 * (time.perf_counter() - started)
         own = [sightings.boxes.take(index == number) for number in range(len(cameras))]
         return SetResult(
@@ -249,13 +247,6 @@ class Pipeline:
         told = site.accuracy
         settings = replace(self.settings.fusion, calibration_sigma_m=told.camera_m, calibration_sigma_rad=told.camera_rad)
         return fuse(seen.boxes, seen.camera_index, seen.cameras, settings, seen.terms)
-
-    def _reported(self, boxes: Boxes) -> NDArray[np.bool_]:
-        confident = boxes.score >= self.settings.min_fused_score
-        if self.settings.method == "paper":
-            return confident
-        sigma = np.sqrt(boxes.covariance[:, 0, 0] + boxes.covariance[:, 1, 1])
-        return confident & (sigma <= self.settings.max_position_sigma_m)
 
     def decode(self, frame_set: FrameSet) -> tuple[list[Still], dict[str, FrameError]]:
         """The first step alone: every frame at the sizes that the networks want, and the cameras whose frames are damaged."""

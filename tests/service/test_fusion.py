@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.association import best_of_duplicates, gated_assignment, mahalanobis_cost
-from service.fusion import FusionSettings, footprint_doubt, fuse
+from service.confidence import Confidence, footprint_doubt, log_odds
+from service.fusion import FusionSettings, fuse
 from service.geometry.boxes import Boxes, box_states, project_extents
 from service.geometry.camera import Camera
 from service.geometry.ground import GroundPlane
@@ -14,10 +15,10 @@ from service.geometry.iou import iou_3d, iou_bev
 from service.geometry.transforms import invert_rigid, pole_camera_pose, rigid, rotation_z, wrap_angle
 from service.lifting import lift
 from service.measurements import Measurements
+from service.pipeline import CONFIDENCE
 
 K = np.array([[642.0, 0.0, 641.5], [0.0, 642.0, 191.5], [0.0, 0.0, 1.0]])
 SIGMA_DIMS = np.array([0.2, 0.06, 0.06])
-ANYWHERE = FusionSettings(silence_ratio=1.0)
 
 
 def four_cameras(rng=None, error_deg=0.0):
@@ -135,7 +136,7 @@ def test_nothing_in_nothing_out():
 
 def test_one_box_of_one_camera_stays_what_it_is():
     boxes = some_boxes([car(3.0, 4.0, 2.5)])
-    fused = fuse(boxes, np.array([2]), four_cameras(), ANYWHERE)
+    fused = fuse(boxes, np.array([2]), four_cameras())
     np.testing.assert_allclose(box_states(fused.boxes), box_states(boxes), atol=1e-12)
     np.testing.assert_allclose(fused.boxes.score, boxes.score)
     np.testing.assert_allclose(fused.boxes.flip_log_odds, boxes.flip_log_odds)
@@ -147,21 +148,19 @@ def test_one_box_of_one_camera_stays_what_it_is():
 
 def test_more_cameras_know_the_place_better_but_not_the_size():
     states = [car(0.1), car(-0.1), car(0.0, 0.1), car(0.0, -0.1)]
-    one = fuse(some_boxes(states[:1]), np.array([0]), four_cameras(), ANYWHERE).boxes
-    four = fuse(some_boxes(states), np.arange(4), four_cameras(), ANYWHERE).boxes
+    one = fuse(some_boxes(states[:1]), np.array([0]), four_cameras()).boxes
+    four = fuse(some_boxes(states), np.arange(4), four_cameras()).boxes
     assert len(four) == 1
     np.testing.assert_allclose(four.center[0], [0.0, 0.0, 0.75], atol=1e-3)
     np.testing.assert_allclose(np.diag(four.covariance[0])[:2], np.diag(one.covariance[0])[:2] / 4, rtol=1e-2)
     np.testing.assert_allclose(np.diag(four.covariance[0])[3:6], np.diag(one.covariance[0])[3:6])
-    assert four.score[0] > one.score[0]
-    np.testing.assert_allclose(four.score[0], 1 - 0.2**4)
 
 
 def test_position_follows_the_camera_that_knows_it():
     boxes = some_boxes([car(0.0), car(0.4)])
     boxes.covariance[0, :2, :2] = np.diag([0.01, 1.0])
     boxes.covariance[1, :2, :2] = np.diag([1.0, 0.01])
-    fused = fuse(boxes, np.arange(2), four_cameras(), ANYWHERE).boxes
+    fused = fuse(boxes, np.arange(2), four_cameras()).boxes
     assert len(fused) == 1
     assert fused.center[0, 0] < 0.05
 
@@ -169,30 +168,30 @@ def test_position_follows_the_camera_that_knows_it():
 @pytest.mark.parametrize("yaw", [0.0, 1.2, np.pi / 2, -np.pi, 3.1])
 def test_a_camera_with_a_flipped_heading_is_outvoted(yaw):
     states = [car(yaw=yaw - 0.04), car(yaw=yaw + 0.04), car(yaw=yaw + np.pi)]
-    fused = fuse(some_boxes(states, flip=[1.0, 1.0, 1.5]), np.arange(3), four_cameras(), ANYWHERE).boxes
+    fused = fuse(some_boxes(states, flip=[1.0, 1.0, 1.5]), np.arange(3), four_cameras()).boxes
     np.testing.assert_allclose(wrap_angle(fused.yaw - yaw), 0.0, atol=1e-9)
     np.testing.assert_allclose(fused.flip_log_odds, 0.5)
-    sure = fuse(some_boxes(states, flip=[1.0, 1.0, 2.5]), np.arange(3), four_cameras(), ANYWHERE).boxes
+    sure = fuse(some_boxes(states, flip=[1.0, 1.0, 2.5]), np.arange(3), four_cameras()).boxes
     np.testing.assert_allclose(np.abs(wrap_angle(sure.yaw - yaw)), np.pi, atol=1e-9)
 
 
 def test_neighbouring_lanes_stay_apart_however_vague_the_boxes():
     boxes = some_boxes([car(0, 0), car(0, 3.2)], sigma=(3, 3, 0.1, 0.2, 0.06, 0.06, 0.07))
-    fused = fuse(boxes, np.array([0, 1]), four_cameras(), ANYWHERE)
+    fused = fuse(boxes, np.array([0, 1]), four_cameras())
     assert len(fused.boxes) == 2
     assert fused.members.sum(1).tolist() == [1, 1]
 
 
 def test_a_camera_gives_a_cluster_one_box_only():
     boxes = some_boxes([car(0, 0), car(0, 2.5), car(0, 0.2)], sigma=(1, 1, 0.1, 0.2, 0.06, 0.06, 0.07))
-    fused = fuse(boxes, np.array([0, 0, 1]), four_cameras(), ANYWHERE)
+    fused = fuse(boxes, np.array([0, 0, 1]), four_cameras())
     assert len(fused.boxes) == 2
     assert fused.source[0] == fused.source[2] != fused.source[1]
 
 
 def test_duplicates_of_one_camera_count_once():
     boxes = some_boxes([car(0.0), car(0.3), car(12.0)], score=[0.5, 0.7, 0.6])
-    fused = fuse(boxes, np.zeros(3, np.int64), four_cameras(), ANYWHERE)
+    fused = fuse(boxes, np.zeros(3, np.int64), four_cameras())
     assert len(fused.boxes) == 2
     assert fused.source.tolist() == [0, 0, 1]
     np.testing.assert_allclose(fused.boxes.score, [0.7, 0.6])
@@ -201,7 +200,7 @@ def test_duplicates_of_one_camera_count_once():
 
 def test_overlapping_vehicles_become_one_though_the_gate_kept_them_apart():
     boxes = some_boxes([car(0.0), car(0.9)], sigma=(0.05, 0.05, 0.05, 0.2, 0.06, 0.06, 0.07))
-    strict = replace(ANYWHERE, calibration_sigma_rad=0.0, calibration_sigma_m=0.02)
+    strict = FusionSettings(calibration_sigma_rad=0.0, calibration_sigma_m=0.02)
     fused = fuse(boxes, np.array([0, 3]), four_cameras(), strict)
     assert len(fused.boxes) == 1
     np.testing.assert_allclose(fused.boxes.center[0, 0], 0.45)
@@ -219,28 +218,28 @@ def test_doubt_about_the_footprint_lowers_the_score_and_the_rank():
     covariance[1, :2, :2] *= 16.0
     boxes = replace(boxes, covariance=covariance, score=np.array([0.7, 0.8]))
     plain = fuse(boxes, np.zeros(2, np.int64), four_cameras()[:1])
-    doubted = fuse(boxes, np.zeros(2, np.int64), four_cameras()[:1], FusionSettings(doubt=2.0))
+    doubted = fuse(boxes, np.zeros(2, np.int64), four_cameras()[:1], FusionSettings(confidence=Confidence(doubt=-2.0)))
     assert plain.boxes.center[0, 0] < 0 < doubted.boxes.center[0, 0]
-    expected = plain.boxes.score[::-1] * np.exp(-2.0 * footprint_doubt(doubted.boxes))
-    np.testing.assert_allclose(doubted.boxes.score, expected)
-    # A standard deviation of a tenth of the length and a fifth of the width, whichever way the car points.
-    turned = replace(doubted.boxes, yaw=np.array([0.3, 2.0]), dims_lwh=np.array([[4.0, 2.0, 1.5]] * 2))
-    axes = np.array([[[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]] for a in turned.yaw])
-    turned.covariance[:, :2, :2] = axes.transpose(0, 2, 1) @ np.diag([0.16, 0.16]) @ axes
-    np.testing.assert_allclose(footprint_doubt(turned), 0.3)
+    lowered = log_odds(plain.boxes.score[::-1]) - 2.0 * np.log(footprint_doubt(doubted.boxes))
+    np.testing.assert_allclose(log_odds(doubted.boxes.score), lowered)
 
 
 def test_what_others_should_see_and_do_not_is_less_certain():
-    cameras = four_cameras()
-    odds = np.array([fuse(some_boxes([car()] * n), np.arange(n), cameras).boxes.score[0] for n in range(1, 5)])
-    odds /= 1 - odds
-    expected = 1 - 0.2 ** np.arange(1, 5)
-    np.testing.assert_allclose(odds, expected / (1 - expected) * 0.8 ** np.arange(3, -1, -1))
-    fewer = [fuse(some_boxes([car()]), np.array([0]), cameras[:n]).boxes.score[0] for n in range(1, 5)]
+    cameras, wary = four_cameras(), FusionSettings(confidence=Confidence(silent=-0.5))
+    odds = [log_odds(fuse(some_boxes([car()] * n), np.arange(n), cameras, wary).boxes.score)[0] for n in range(1, 5)]
+    np.testing.assert_allclose(odds, log_odds(np.array(0.8)) - 0.5 * np.arange(3, -1, -1))
+    fewer = [fuse(some_boxes([car()]), np.array([0]), cameras[:n], wary).boxes.score[0] for n in range(1, 5)]
     assert (np.diff(fewer) < 0).all()
     np.testing.assert_allclose(fewer[0], 0.8)
     far_away = some_boxes([car(-60.0, -60.0)])
-    np.testing.assert_allclose(fuse(far_away, np.array([0]), cameras).boxes.score, 0.8)
+    np.testing.assert_allclose(fuse(far_away, np.array([0]), cameras, wary).boxes.score, 0.8)
+
+
+def test_in_a_pipeline_each_camera_that_agrees_makes_a_vehicle_surer():
+    cameras, fitted = four_cameras(), FusionSettings(confidence=CONFIDENCE)
+    scores = [fuse(some_boxes([car()] * n), np.arange(n), cameras, fitted).boxes.score[0] for n in range(1, 5)]
+    assert (np.diff(scores) > 0).all()
+    assert scores[0] < 0.5 < scores[-1]
 
 
 @given(st.floats(-3.1, 3.1), st.floats(-300, 300), st.floats(-300, 300))
@@ -346,8 +345,8 @@ def test_duplicates_are_found_as_by_looking_at_all_pairs(rows):
 
 def test_two_cameras_that_are_one_do_not_know_the_size_better():
     boxes = some_boxes([car()] * 4)
-    one = fuse(boxes.take(np.array([0])), np.array([0]), four_cameras(), ANYWHERE).boxes
-    four = fuse(boxes, np.arange(4), four_cameras(), ANYWHERE).boxes
+    one = fuse(boxes.take(np.array([0])), np.array([0]), four_cameras()).boxes
+    four = fuse(boxes, np.arange(4), four_cameras()).boxes
     np.testing.assert_allclose(four.covariance[0, 3:6, 3:6], one.covariance[0, 3:6, 3:6])
 
 
