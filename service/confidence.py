@@ -2,7 +2,7 @@
 
 A detector's score says that something is there. Whether the box fits it, the covariance says; and cameras agree on false
 alarms more often than chance, so that their scores do not multiply. Each piece of evidence moves the log-odds by a weight,
-fitted by logistic regression on validation scenes (``bench-accuracy confidence``; docs: fusion).
+fitted by logistic regression on validation scenes (docs: fusion).
 """
 
 from __future__ import annotations

@@ -17,14 +17,14 @@ class MixConfig:
     """Shares of the draws by the first part of a sample's source; those of the data sets present are scaled to sum to 1."""
 
     shares: tuple[tuple[str, float], ...] = (
-        ("simulated", 0.4),
+        ("simulated", 0.48),
         # One camera filmed all of the gantry's frames: at most 40 % of the roadside share.
-        ("rf100_vehicles_tollroad_id", 0.09),
-        ("atl_v2_highway_mix", 0.13),
-        ("farzad_overpass_vehicle_boxonly", 0.1),
+        ("rf100_vehicles_tollroad_id", 0.07),
+        ("atl_v2_highway_mix", 0.12),
+        ("farzad_overpass_vehicle_boxonly", 0.08),
         ("carla2d", 0.13),
-        ("pandaset", 0.1),
-        ("traffic_videos", 0.05),
+        ("pandaset", 0.08),
+        ("traffic_videos", 0.04),
     )
 
 
