@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import signal
+import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.division import Division
 from service.errors import FrameError, PackError, QuadliftError
 from service.frames import EncodedFrame, FrameSet
 from service.geometry.camera import Camera
@@ -174,8 +176,9 @@ def test_a_set_is_divided_between_idle_processes(start: Callable[..., ProcessRun
 
 def test_who_becomes_idle_joins_a_set_that_is_being_run(start: Callable[..., ProcessRunner], tmp_path: Path) -> None:
     runner, begun = start(2, "Divisible"), tmp_path / "begun"
+    # A set every 30 s: dividing pays, and its half is waited for.
+    runner._division = Division(2, itertools.count(0.0, 30.0).__next__)
     runner._division.took(8.0, divided=False)
-    runner._division._interval_s = 30.0
     busy = threading.Thread(target=lambda: runner.run(asking(f"wait {begun}")))
     busy.start()
     until(begun.exists)
