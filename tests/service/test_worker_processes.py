@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 import os
 import signal
-import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator
