@@ -39,7 +39,8 @@ def video(tmp_path: Path) -> Path:
 
 async def collect(url: str, messages: list[Detections], opened: asyncio.Event) -> None:
     async with AsyncClient(url) as client:
-        asyncio.get_running_loop().call_later(0.3, opened.set)
+        # The client does not say when its stream is open.
+        asyncio.get_running_loop().call_later(1.0, opened.set)
         async for message in client.stream("demo"):
             messages.append(message)
 
@@ -51,6 +52,11 @@ async def streamed(url: str, sending: Any) -> list[Detections]:
     listening = asyncio.create_task(collect(url, messages, opened))
     await opened.wait()
     await sending
+    # A busy machine may take seconds for the first.
+    for _ in range(100):
+        if messages:
+            break
+        await asyncio.sleep(0.1)
     await asyncio.sleep(0.3)
     listening.cancel()
     await asyncio.gather(listening, return_exceptions=True)
