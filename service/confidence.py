@@ -13,10 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.geometry.boxes import Boxes
-from service.geometry.transforms import Array, between
+from service.geometry.transforms import Array
+from service.odds import log_odds, probability
 
 MAX_LOG_ODDS = 20.0
 """Scores of 0 and 1 count as this much."""
+LEAST_SCORE = float(probability(np.array(-MAX_LOG_ODDS)))
+"""The same as a score."""
 _LEAST_DOUBT = 1e-6
 
 
@@ -48,7 +51,7 @@ def evidence(boxes: Boxes, cameras: NDArray[np.int64], silences: Array) -> Array
     should and do not.
     """
     doubt = np.log(np.maximum(footprint_doubt(boxes), _LEAST_DOUBT))
-    return np.stack([log_odds(boxes.score), doubt, cameras > 1, silences], 1)
+    return np.stack([log_odds(boxes.score, LEAST_SCORE), doubt, cameras > 1, silences], 1)
 
 
 def footprint_doubt(boxes: Boxes) -> Array:
@@ -63,19 +66,5 @@ def footprint_doubt(boxes: Boxes) -> Array:
 
 def mean_score(score: Array, row: NDArray[np.int64], rows: int) -> Array:
     """Scores (M,) of vehicles from their cameras' (K,), ``row`` (K,) saying whose: the mean of the log-odds."""
-    total = np.bincount(row, log_odds(score), rows)
+    total = np.bincount(row, log_odds(score, LEAST_SCORE), rows)
     return probability(total / np.bincount(row, minlength=rows))
-
-
-def log_odds(probabilities: Array) -> Array:
-    """ln(p / (1 - p)), bounded."""
-    least = float(probability(np.array(-MAX_LOG_ODDS)))
-    clipped = between(probabilities, least, 1.0 - least)
-    odds: Array = np.log(clipped / (1.0 - clipped))
-    return odds
-
-
-def probability(log_odds: Array) -> Array:
-    """1 / (1 + e^-x)."""
-    result: Array = 1.0 / (1.0 + np.exp(-between(log_odds, -500.0, 500.0)))
-    return result

@@ -180,9 +180,9 @@ def reduced(image: UInt8Image, max_width: int) -> UInt8Image:
     factor = -(-width // max_width)
     if factor == 1:
         return image
+    if width // factor < WHOLE_FACTOR_LEAVES * max_width:
+        return resized(image, max_width)
     size = (width // factor, max(round(height / factor), 1))
-    if size[0] < WHOLE_FACTOR_LEAVES * max_width:
-        size = (max_width, max(round(height * max_width / width), 1))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 

@@ -22,6 +22,7 @@ from service.fusion import CameraParts, FusedBoxes
 from service.geometry.boxes import STATE_DIM, YAW, Boxes, box_states
 from service.geometry.transforms import Array, wrap_angle
 from service.motion import SPEED, MotionSettings, blurred, corrected, newborn, predicted, turned_about, velocity
+from service.odds import log_odds, probability
 
 _BOX = slice(0, STATE_DIM)
 _NS_PER_S = 1e9
@@ -208,7 +209,7 @@ class Tracker:
             [str(number) for number in seen.number],
             velocity(seen.state),
             np.sqrt(seen.covariance[:, SPEED, SPEED]),
-            1.0 / (1.0 + np.exp(-seen.existence)),
+            probability(seen.existence),
         )
 
 
@@ -248,8 +249,7 @@ def _advanced(tracks: _Tracks, elapsed_s: float, settings: TrackSettings) -> _Tr
 
 def _seen_more(existence: Array, score: Array, settings: TrackSettings) -> Array:
     """Log-odds (T,) of existence after a box of ``score`` (T,) more; a box never makes its vehicle less likely."""
-    clipped = np.clip(score, 1.0 - _MAX_SCORE, _MAX_SCORE)
-    gained = np.maximum(settings.hit_log_odds + np.log(clipped / (1.0 - clipped)), 0.2 * settings.hit_log_odds)
+    gained = np.maximum(settings.hit_log_odds + log_odds(score, 1.0 - _MAX_SCORE), 0.2 * settings.hit_log_odds)
     return np.minimum(existence + gained, settings.max_log_odds)
 
 

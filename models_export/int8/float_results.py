@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import onnx
 from numpy.typing import NDArray
-from onnx import numpy_helper
 
-from models_export.int8.graph_writer import GraphWriter
+from models_export.graphs import GraphWriter, constants, makers
 
 _INT8_MOST = 127
 
@@ -21,12 +20,11 @@ def multiply_in_int8(graph: onnx.GraphProto, outputs: Sequence[str]) -> None:
     lose little. As a matrix product of cells by channels ONNX Runtime does that without turning the map into floats and into
     another order first. Other outputs stay as they are.
     """
-    constants = {entry.name: numpy_helper.to_array(entry) for entry in graph.initializer}
-    makers = {name: node for node in graph.node for name in node.output}
+    values, made = constants(graph), makers(graph)
     for output in outputs:
-        layer = makers[output]
-        read = makers.get(layer.input[0])
-        weight = constants.get(layer.input[1]) if len(layer.input) > 1 else None
+        layer = made[output]
+        read = made.get(layer.input[0])
+        weight = values.get(layer.input[1]) if len(layer.input) > 1 else None
         if layer.op_type != "Conv" or read is None or read.op_type != "DequantizeLinear" or weight is None:
             continue
         if weight.shape[2:] == (1, 1):

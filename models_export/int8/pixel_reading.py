@@ -10,7 +10,7 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
-from models_export.int8.graph_writer import GraphWriter
+from models_export.graphs import GraphWriter, makers, users
 from models_export.nets.blocks import PIXEL_OFFSET, PIXEL_SCALE
 from service.nets.canvas import ALIGN_PX
 
@@ -66,8 +66,8 @@ def read_in_groups(graph: onnx.GraphProto) -> None:
     are not whole groups.
     """
     chain = _chain(graph, _GROUPED)
-    makers = {node.output[0]: node for node in graph.node}
-    if not chain or not all(name in makers for name in chain[2].input):
+    made = makers(graph)
+    if not chain or not all(name in made for name in chain[2].input):
         return
     transpose, _, conv, quantize = chain
     old: dict[str, Any] = {a.name: helper.get_attribute_value(a) for a in conv.attribute}
@@ -75,7 +75,7 @@ def read_in_groups(graph: onnx.GraphProto) -> None:
     if groups is None or not _is_multiple(graph.input[0].type.tensor_type.shape.dim[2], groups.pixels):
         return
     added = GraphWriter(graph, "grouped")
-    weight, *bias = [makers[name] for name in conv.input[1:]]
+    weight, *bias = [made[name] for name in conv.input[1:]]
     channels = next(entry.dims[0] for entry in graph.initializer if entry.name == weight.input[0])
     kernel = _grouped_kernel(added, weight, groups, old["kernel_shape"])
     weight.input[:] = [kernel, *_repeated(added, weight, weight.input[1:])]
@@ -93,11 +93,11 @@ def read_in_groups(graph: onnx.GraphProto) -> None:
     del graph.value_info[:]
     # Behind the rounding: bytes are moved, not floats.
     (rounded,) = quantize.output
-    users = [node for node in graph.node if rounded in node.input]
-    beside = added.before(users[0], "Transpose", [rounded], perm=(0, 2, 3, 1))
-    apart = added.reshaped(users[0], beside, (0, 0, -1, channels))
-    result = added.before(users[0], "Transpose", [apart], perm=(0, 3, 1, 2))
-    for user in users:
+    readers = users(graph, rounded)
+    beside = added.before(readers[0], "Transpose", [rounded], perm=(0, 2, 3, 1))
+    apart = added.reshaped(readers[0], beside, (0, 0, -1, channels))
+    result = added.before(readers[0], "Transpose", [apart], perm=(0, 3, 1, 2))
+    for user in readers:
         user.input[:] = [result if name == rounded else name for name in user.input]
 
 
@@ -153,9 +153,9 @@ def _chain(graph: onnx.GraphProto, kinds: Sequence[str]) -> list[onnx.NodeProto]
     found: list[onnx.NodeProto] = []
     name = graph.input[0].name
     for kind in kinds:
-        users = [node for node in graph.node if name in node.input and node.op_type != "Shape"]
-        if len(users) != 1 or users[0].op_type != kind:
+        after = [node for node in users(graph, name) if node.op_type != "Shape"]
+        if len(after) != 1 or after[0].op_type != kind:
             return []
-        found.append(users[0])
-        name = users[0].output[0]
+        found.append(after[0])
+        name = after[0].output[0]
     return found

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 import onnx
 from numpy.typing import NDArray
-from onnx import helper, numpy_helper
+from onnx import helper
 
-from models_export.int8.graph_writer import GraphWriter
+from models_export.graphs import GraphWriter, constants, makers, users
 
 _FACTORS = (1.0, 1.0, 2.0, 2.0)
 
@@ -21,24 +21,23 @@ def repeat_cells(graph: onnx.GraphProto) -> None:
     channels side by side in memory, a cell repeated along its row, and then the row, are two long copies. Other resizing
     stays as it is.
     """
-    constants = {entry.name: numpy_helper.to_array(entry) for entry in graph.initializer}
-    makers = {name: node for node in graph.node for name in node.output}
-    for resize in [node for node in graph.node if node.op_type == "Resize" and _doubles(node, constants)]:
-        read = makers[resize.input[0]]
-        (rounded,) = [node for node in graph.node if resize.output[0] in node.input]
+    values, made = constants(graph), makers(graph)
+    for resize in [node for node in graph.node if node.op_type == "Resize" and _doubles(node, values)]:
+        read = made[resize.input[0]]
+        (rounded,) = users(graph, resize.output[0])
         # Between two roundings of one scale nothing is rounded.
         if read.op_type == "DequantizeLinear" and rounded.op_type == "QuantizeLinear" and read.input[1:] == rounded.input[1:]:
             _copy(graph, rounded, read.input[0])
             graph.node.remove(resize)
             graph.node.remove(rounded)
-            if not any(read.output[0] in node.input for node in graph.node):
+            if not users(graph, read.output[0]):
                 graph.node.remove(read)
 
 
-def _doubles(resize: onnx.NodeProto, constants: Mapping[str, NDArray[np.generic]]) -> bool:
+def _doubles(resize: onnx.NodeProto, values: Mapping[str, NDArray[np.generic]]) -> bool:
     """Whether every cell comes twice along both axes."""
     mode = [helper.get_attribute_value(a) for a in resize.attribute if a.name == "mode"]
-    factors = constants.get(resize.input[2]) if len(resize.input) > 2 else None
+    factors = values.get(resize.input[2]) if len(resize.input) > 2 else None
     return mode == [b"nearest"] and factors is not None and tuple(factors.tolist()) == _FACTORS
 
 

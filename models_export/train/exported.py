@@ -15,9 +15,9 @@ import numpy as np
 import onnx
 import torch
 from google.protobuf.message import DecodeError
-from onnx import numpy_helper
 from torch import Tensor, nn
 
+from models_export.graphs import constants
 from models_export.train.config import take_priors
 from models_export.train.task import Batch, Task
 from service.errors import InputError
@@ -104,7 +104,7 @@ def _metadata(model: onnx.ModelProto) -> dict[str, Any]:
 
 def _values(graph: onnx.GraphProto) -> dict[str, Array]:
     """Constants by the torch parameter they came from; quantized ones are back in their units."""
-    stored = {entry.name: numpy_helper.to_array(entry) for entry in graph.initializer}
+    stored = constants(graph)
     values: dict[str, Array] = {}
     for name, array in stored.items():
         if not name.endswith("_quantized"):

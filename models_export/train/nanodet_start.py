@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import onnx
-from onnx import numpy_helper
 
 from models_export.data.nanodet import CREDIT, MEAN_BGR, STD_BGR
+from models_export.graphs import constants
 from models_export.nets.blocks import PIXEL_OFFSET, PIXEL_SCALE
 from models_export.nets.detector import DetectorConfig
 from models_export.train.exported import read_model, start_from
@@ -46,7 +46,7 @@ def nanodet_values(graph: onnx.GraphProto, config: DetectorConfig) -> dict[str, 
 
     Raises ValueError when the graph has not as many convolutions as NanoDet-g.
     """
-    stored = {entry.name: numpy_helper.to_array(entry).astype(np.float64) for entry in graph.initializer}
+    stored = {name: array.astype(np.float64) for name, array in constants(graph).items()}
     convolutions = [node for node in graph.node if node.op_type == "Conv"]
     names = list(_names(config))
     if len(convolutions) != len(names):

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.geometry.transforms import Array, between
+from service.geometry.transforms import Array
 from service.nets.detections import Detections
 from service.nets.detector_spec import DROPPED, DetectorSpec
+from service.odds import log_odds, probability
 
 MAX_CANDIDATES = 300
 """Boxes of one image that enter non-maximum suppression, best first."""
@@ -62,7 +63,7 @@ def _quadlift(heads: Outputs, spec: DetectorSpec, threshold: float) -> _Candidat
     centres free to reach into the next cell.
     """
     cells = _anchored_cells(heads, spec, threshold)
-    fields = _sigmoid(cells.logits)
+    fields = probability(cells.logits)
     center = (2.0 * fields[:, :2] - 0.5 + cells.cell) * cells.stride
     size = (2.0 * fields[:, 2:4]) ** 2 * cells.anchor
     return _scored(center, size, fields[:, 4:])
@@ -74,9 +75,9 @@ def _yolov3(heads: Outputs, spec: DetectorSpec, threshold: float) -> _Candidates
     Per anchor: centre = (sigmoid(t) + cell) * stride, size = anchor * exp(t), score = sigmoid(objectness) * sigmoid(class).
     """
     cells = _anchored_cells(heads, spec, threshold)
-    center = (_sigmoid(cells.logits[:, :2]) + cells.cell) * cells.stride
+    center = (probability(cells.logits[:, :2]) + cells.cell) * cells.stride
     size = cells.anchor * np.exp(np.minimum(cells.logits[:, 2:4], MAX_LOG_SIZE))
-    return _scored(center, size, _sigmoid(cells.logits[:, 4:]))
+    return _scored(center, size, probability(cells.logits[:, 4:]))
 
 
 def _yolox(heads: Outputs, spec: DetectorSpec, threshold: float) -> _Candidates:
@@ -104,7 +105,7 @@ def _nanodet(heads: Outputs, spec: DetectorSpec, threshold: float) -> _Candidate
     else:
         scores = np.concatenate(heads[: len(spec.strides)])
         distances = np.concatenate(heads[len(spec.strides) :])
-    rows = _rows_above(scores, spec, _logit(threshold) if spec.is_logit else threshold)
+    rows = _rows_above(scores, spec, float(log_odds(threshold, _LEAST_PROBABILITY)) if spec.is_logit else threshold)
     bins = distances[rows].astype(np.float64).reshape(len(rows), 4, distances.shape[1] // 4)
     weights = np.exp(bins - bins.max(2, keepdims=True))
     cell, stride = _flat_cells(spec)
@@ -112,7 +113,7 @@ def _nanodet(heads: Outputs, spec: DetectorSpec, threshold: float) -> _Candidate
     center = (cell[rows] + spec.cell_center) * stride[rows]
     xyxy = np.concatenate([center - ltrb[:, :2], center + ltrb[:, 2:]], 1)
     chosen = scores[rows].astype(np.float64)
-    return _best_class(xyxy, _sigmoid(chosen) if spec.is_logit else chosen)
+    return _best_class(xyxy, probability(chosen) if spec.is_logit else chosen)
 
 
 def _ultralytics(heads: Outputs, spec: DetectorSpec, threshold: float) -> _Candidates:
@@ -178,7 +179,7 @@ class _AnchoredCells:
 def _anchored_cells(heads: Outputs, spec: DetectorSpec, threshold: float) -> _AnchoredCells:
     """Cells whose objectness passes; a score is at most its objectness."""
     logits, cells, sizes = [], [], []
-    least = _logit(threshold)
+    least = log_odds(threshold, _LEAST_PROBABILITY)
     for head, anchors in zip(heads, spec.anchors_px, strict=True):
         grid = head.reshape(len(anchors), BOX_FIELDS + spec.network_classes, *head.shape[-2:])
         passes = grid[:, 4] > least
@@ -235,12 +236,3 @@ def _class_ids(values: NDArray[np.generic], spec: DetectorSpec) -> NDArray[np.in
 
 def _box(center: Array, size: Array) -> Array:
     return np.concatenate([center - 0.5 * size, center + 0.5 * size], 1)
-
-
-def _sigmoid(logits: Array) -> Array:
-    return np.asarray(1.0 / (1.0 + np.exp(-between(logits, -500.0, 500.0))))
-
-
-def _logit(probability: float) -> float:
-    bounded = min(max(probability, _LEAST_PROBABILITY), 1.0 - _LEAST_PROBABILITY)
-    return float(np.log(bounded / (1.0 - bounded)))

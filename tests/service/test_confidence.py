@@ -7,8 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.confidence import MAX_LOG_ODDS, Confidence, evidence, footprint_doubt, log_odds, mean_score, probability
+from service.confidence import LEAST_SCORE, MAX_LOG_ODDS, Confidence, evidence, footprint_doubt, mean_score
 from service.geometry.boxes import Boxes
+from service.odds import log_odds as odds_of
+from service.odds import probability
+
+
+def log_odds(p: np.ndarray) -> np.ndarray:
+    return odds_of(p, LEAST_SCORE)
+
 
 SCORES = st.lists(st.floats(0.01, 0.99), min_size=1, max_size=8)
 

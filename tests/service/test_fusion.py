@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.association import best_of_duplicates, gated_assignment, mahalanobis_cost
-from service.confidence import Confidence, footprint_doubt, log_odds
+from service.confidence import LEAST_SCORE, Confidence, footprint_doubt
 from service.fusion import FusionSettings, fuse
 from service.geometry.boxes import Boxes, box_states, project_extents
 from service.geometry.camera import Camera
@@ -15,6 +15,7 @@ from service.geometry.iou import iou_3d, iou_bev
 from service.geometry.transforms import invert_rigid, pole_camera_pose, rigid, rotation_z, wrap_angle
 from service.lifting import lift
 from service.measurements import Measurements
+from service.odds import log_odds
 from service.pipeline import CONFIDENCE
 
 K = np.array([[642.0, 0.0, 641.5], [0.0, 642.0, 191.5], [0.0, 0.0, 1.0]])
@@ -220,14 +221,16 @@ def test_doubt_about_the_footprint_lowers_the_score_and_the_rank():
     plain = fuse(boxes, np.zeros(2, np.int64), four_cameras()[:1])
     doubted = fuse(boxes, np.zeros(2, np.int64), four_cameras()[:1], FusionSettings(confidence=Confidence(doubt=-2.0)))
     assert plain.boxes.center[0, 0] < 0 < doubted.boxes.center[0, 0]
-    lowered = log_odds(plain.boxes.score[::-1]) - 2.0 * np.log(footprint_doubt(doubted.boxes))
-    np.testing.assert_allclose(log_odds(doubted.boxes.score), lowered)
+    lowered = log_odds(plain.boxes.score[::-1], LEAST_SCORE) - 2.0 * np.log(footprint_doubt(doubted.boxes))
+    np.testing.assert_allclose(log_odds(doubted.boxes.score, LEAST_SCORE), lowered)
 
 
 def test_what_others_should_see_and_do_not_is_less_certain():
     cameras, wary = four_cameras(), FusionSettings(confidence=Confidence(silent=-0.5))
-    odds = [log_odds(fuse(some_boxes([car()] * n), np.arange(n), cameras, wary).boxes.score)[0] for n in range(1, 5)]
-    np.testing.assert_allclose(odds, log_odds(np.array(0.8)) - 0.5 * np.arange(3, -1, -1))
+    odds = [
+        log_odds(fuse(some_boxes([car()] * n), np.arange(n), cameras, wary).boxes.score, LEAST_SCORE)[0] for n in range(1, 5)
+    ]
+    np.testing.assert_allclose(odds, log_odds(0.8, LEAST_SCORE) - 0.5 * np.arange(3, -1, -1))
     fewer = [fuse(some_boxes([car()]), np.array([0]), cameras[:n], wary).boxes.score[0] for n in range(1, 5)]
     assert (np.diff(fewer) < 0).all()
     np.testing.assert_allclose(fewer[0], 0.8)

@@ -1,4 +1,4 @@
-"""Writes nodes and constants into an ONNX graph."""
+"""What an ONNX graph holds, by name, and what is written into it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,21 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 from onnx import helper, numpy_helper
+
+
+def constants(graph: onnx.GraphProto) -> dict[str, NDArray[np.generic]]:
+    """The initializers."""
+    return {entry.name: numpy_helper.to_array(entry) for entry in graph.initializer}
+
+
+def makers(graph: onnx.GraphProto) -> dict[str, onnx.NodeProto]:
+    """The node that gives each tensor."""
+    return {name: node for node in graph.node for name in node.output}
+
+
+def users(graph: onnx.GraphProto, tensor: str) -> list[onnx.NodeProto]:
+    """The nodes that take a tensor, in the graph's order."""
+    return [node for node in graph.node if tensor in node.input]
 
 
 class GraphWriter:
