@@ -160,7 +160,9 @@ def replay(client: Client, clip: Clip, rate_hz: float, seconds: float | None, pr
             except ServiceError as error:
                 progress.refused(error)
             live.update(status_line(progress, url))
-            due = int((time.monotonic() - began) * rate_hz)
+            elapsed_s = time.monotonic() - began
+            # What would come after the end is not skipped.
+            due = int((elapsed_s if seconds is None else min(elapsed_s, seconds)) * rate_hz)
             progress.skipped += max(0, due - number - 1)
             number = max(number + 1, due)
 
