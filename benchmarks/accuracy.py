@@ -18,6 +18,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from benchmarks.clip_score import score_clip, score_roadside
+from benchmarks.confidence_fit import candidates, confidence_figures, confidence_table
 from benchmarks.drive import RULES as DRIVE_RULES
 from benchmarks.drive import drive_figures, drive_table, score_pack, write_pictures
 from benchmarks.drive_centres import score_single_cameras
@@ -196,6 +197,23 @@ def scenes_command(
     console.print(accuracy_table(figures, title))
     for table in (distance_table(figures), tracking_table(figures), paper_table(figures)):
         console.print(table)
+
+
+@app.command("confidence")
+def confidence_command(
+    datasets: Annotated[list[Path], typer.Argument(help="Folders of validation scenes, each fitted by itself.")],
+    pack: PackOption = "edge",
+    as_json: JsonOption = False,
+) -> None:
+    """Fit the weights of a fused box's score on scenes with exact truth, and try each set's weights on the others."""
+    with _errors_named():
+        loaded = load_pack(pack)
+        fitted = {str(path): candidates(open_scene_sets(path), lambda s: Pipeline(loaded, s)) for path in datasets}
+        figures = confidence_figures(fitted)
+    if as_json:
+        typer.echo(json.dumps({"pack": pack, "machine": describe_machine(), **figures}, indent=1))
+        return
+    console.print(confidence_table(f"weights of a fused box's score, pack {pack}", figures))
 
 
 def _camera_counts(sets: SceneSets, cameras: int | None) -> list[int]:

@@ -37,7 +37,7 @@ GROUNDS = {
     "none": NO_GROUND,
     "plane 0.06 m + 0.008 Z": LiftSettings(ground_sigma_m=0.06, ground_sigma_per_m=0.008),
     "plane 0.10 m constant": LiftSettings(ground_sigma_m=0.10, ground_sigma_per_m=0.0),
-    "plane 0.10 m constant, squared": LiftSettings(ground_sigma_m=0.10, ground_sigma_per_m=0.0, ground_huber_sigmas=1e9),
+    "plane 0.10 m constant, squared": LiftSettings(ground_sigma_m=0.10, ground_sigma_per_m=0.0, ground_tail_sigmas=1e9),
 }
 
 

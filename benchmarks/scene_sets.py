@@ -98,9 +98,13 @@ def wanted(truth: SceneTruth, fits: NDArray[np.bool_], all_cameras: Sequence[str
 
 def found(boxes: Boxes, classes: Sequence[str], site: Site, track_id: Sequence[str] = ()) -> Found:
     """Boxes of a pipeline as what was found; those of a class that is ignored, or no vehicle, are left out."""
-    named = np.array([classes[index].lower() not in IGNORED | NO_VEHICLES for index in boxes.cls], dtype=bool)
     everything = Found(box_states(boxes), boxes.score, in_view(site, boxes.center), tuple(track_id))
-    return everything.take(named)
+    return everything.take(of_counted_class(boxes, classes))
+
+
+def of_counted_class(boxes: Boxes, classes: Sequence[str]) -> NDArray[np.bool_]:
+    """Which boxes (M,) are of a class that counts."""
+    return np.array([classes[index].lower() not in IGNORED | NO_VEHICLES for index in boxes.cls], dtype=bool)
 
 
 def in_view(site: Site, center: Array) -> NDArray[np.bool_]:

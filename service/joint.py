@@ -58,17 +58,17 @@ def solve_jointly(terms: BoxProblem, vehicle: Index, start: Array, settings: Sol
     """
     count = np.bincount(vehicle)[vehicle]
     share = 1.0 / np.sqrt(count)
-    prior, weight, huber = terms.prior.copy(), terms.prior_weight.copy(), terms.huber.copy()
+    prior, weight, tail = terms.prior.copy(), terms.prior_weight.copy(), terms.tail.copy()
     half_turns = np.round((prior[:, YAW] - start[vehicle, YAW]) / np.pi)
     prior[:, YAW] -= np.pi * half_turns
     weight[:, _SHARED] *= share[:, None]
-    huber[:, GROUND] *= share
+    tail[:, GROUND] *= share
     members = replace(
         terms,
         prior=prior,
         prior_weight=weight,
         ground_weight=terms.ground_weight * share,
-        huber=huber,
+        tail=tail,
     )
     state, hessian = solve(joint(members, vehicle), start, settings)
     return state, covariance_of(hessian)

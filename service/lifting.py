@@ -37,9 +37,10 @@ class LiftSettings:
     """What a metre of distance adds to it: roads are not planes, poses not exact."""
     border_px: float = BORDER_PX
     """An edge this near to the image border is taken as cut by it."""
-    huber_sigmas: float = 2.0
-    """Edges and depths off by more than this count linearly: occlusion, a depth read off another object."""
-    ground_huber_sigmas: float = 1.0
+    tail_sigmas: float = 3.0
+    """Edges and depths off by this many sigmas count half, and less beyond (Cauchy): occlusion, a depth read off another
+    object."""
+    ground_tail_sigmas: float = 2.0
     """The same for the ground: real roads leave a plane by more than noise does (measured on KITTI: docs, lifting)."""
     start_sigma_m: float = 50.0
     """Weak pull to the start position; it only keeps boxes finite whose edges are all cut."""
@@ -90,8 +91,8 @@ def _problem(ground: Ground, seen: EdgeMeasurements, m: Measurements, settings: 
     sigma_ground = settings.ground_sigma_m + settings.ground_sigma_per_m * start_depth
     depth, depth_weight = _depth_readings(m)
     position_sigma = np.full((len(m), 3), settings.start_sigma_m)
-    huber = np.full((len(m), FIXED_ROWS + seen.tangents.shape[1]), settings.huber_sigmas)
-    huber[:, GROUND] = settings.ground_huber_sigmas
+    tail = np.full((len(m), FIXED_ROWS + seen.tangents.shape[1]), settings.tail_sigmas)
+    tail[:, GROUND] = settings.ground_tail_sigmas
     return BoxProblem(
         R=seen.R,
         t=seen.t,
@@ -109,7 +110,7 @@ def _problem(ground: Ground, seen: EdgeMeasurements, m: Measurements, settings: 
         ray=seen.center_ray,
         depth=depth,
         depth_weight=depth_weight,
-        huber=huber,
+        tail=tail,
     )
 
 

@@ -38,8 +38,8 @@ from service.solver import SolverSettings
 CONFIDENCE = Confidence(offset=-4.5, score=1.1, doubt=-2.4, several=-0.85, silent=-0.55)
 """``FusionSettings.confidence`` of a pipeline, fitted on validation scenes (docs: fusion): the score is then about the share of
 such boxes that overlap a vehicle by more than half."""
-HUBER_SIGMAS = 1.0
-"""``LiftSettings.huber_sigmas`` of a pipeline: a network's outline of a vehicle that is partly hidden is a guess, and wrong
+TAIL_SIGMAS = 1.0
+"""``LiftSettings.tail_sigmas`` of a pipeline: a network's outline of a vehicle that is partly hidden is a guess, and wrong
 guesses are far off (validation scenes; docs: lifting)."""
 SOLVER = SolverSettings(step_tolerance=1.0)
 """Of a pipeline's lifting and fusion: with networks' outlines, steps shorter than a sigma change no AP (docs: fusion)."""
@@ -68,7 +68,7 @@ class PipelineSettings:
     validation scenes these are 52 %; most of what reading all of them twice would gain (docs: networks)."""
     min_fused_score: float = 0.2
     """Fused boxes of a lower score are dropped."""
-    lift: LiftSettings = field(default_factory=lambda: LiftSettings(huber_sigmas=HUBER_SIGMAS, solver=SOLVER))
+    lift: LiftSettings = field(default_factory=lambda: LiftSettings(tail_sigmas=TAIL_SIGMAS, solver=SOLVER))
     """How exact the ground is, and for fusion the cameras, a site's own ``accuracy`` says."""
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
     fusion: FusionSettings = field(default_factory=lambda: FusionSettings(confidence=CONFIDENCE, solver=SOLVER))

@@ -26,7 +26,6 @@ FIXED_ROWS = 6
 """Rows before the tangents."""
 _EDGE_START = np.array([0, 8, 0, 8])
 _FAR_PARALLEL = 1e-9
-_TINY = 1e-30
 _SIGNS_T = np.ascontiguousarray(CORNER_SIGNS.T)
 _HALF_SIGNS = 0.5 * CORNER_SIGNS
 _OUTWARD = np.array([-1.0, -1.0, 1.0, 1.0])
@@ -45,7 +44,7 @@ _PER_BOX = (
         "prior",
         "prior_weight",
     ),
-    *("ground_weight", "ray", "depth", "depth_weight", "huber"),
+    *("ground_weight", "ray", "depth", "depth_weight", "tail"),
 )
 
 
@@ -85,8 +84,8 @@ class BoxProblem:
     """(N,) depth of the visible surface along the optical axis, metres; any number where the weight is 0."""
     depth_weight: Array
     """(N,) 1 / sigma, 1/m; 0 where there is no reading."""
-    huber: Array
-    """(N, 6 + K) residual (sigmas) from which a row counts linearly."""
+    tail: Array
+    """(N, 6 + K) residual (sigmas) at which a row counts half: the scale of a Cauchy distribution."""
     shift_sigma: Array | None = None
     """(N,) how far, normalised, the whole picture may be shifted along each axis, one sigma: all edges and tangents move
     together. None: not at all."""
@@ -131,14 +130,14 @@ def box_axes(yaw: Array) -> Array:
 
 
 def normal_equations(problem: BoxProblem, state: Array) -> NormalEquations:
-    """Cost, gradient and Hessian at states (N, 7): Huber on the rows, squares on the prior."""
+    """Cost, gradient and Hessian at states (N, 7): Cauchy on the rows, squares on the prior."""
     rows, weight = _whitened(problem, state)
     residual, jacobian = rows[..., STATE_DIM], rows[..., :STATE_DIM]
-    magnitude = np.abs(residual)
-    robust = np.minimum(problem.huber / np.maximum(magnitude, _TINY), 1.0)
-    inner = robust * magnitude
+    scale = problem.tail * problem.tail
+    beyond = residual * residual / scale
+    robust = 1.0 / (1.0 + beyond)
     weighted_t = (jacobian * robust[..., None]).transpose(0, 2, 1)
-    cost = (inner * (magnitude - 0.5 * inner)).sum(1)
+    cost = 0.5 * (scale * np.log1p(beyond)).sum(1)
     if problem.shift_sigma is not None:
         cost -= _free_shift(problem, weight, robust, residual, weighted_t)
     # One product gives the Hessian and, from the residual's column, the gradient.

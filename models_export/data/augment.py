@@ -71,6 +71,10 @@ class AugmentConfig:
     """Probability that another vehicle hides a part: of crops of single vehicles only."""
     hidden_reach: tuple[float, float] = (0.1, 0.45)
     """How far it reaches into the crop over the crop's side."""
+    cut: float = 0.0
+    """Probability that the picture ends within a vehicle: of crops of single vehicles only."""
+    cut_share: tuple[float, float] = (0.1, 0.7)
+    """Of its width or height, what lies beyond."""
 
 
 NO_AUGMENT = AugmentConfig(
@@ -176,6 +180,18 @@ def hidden_behind(crop: Image, other: Image, rng: np.random.Generator, config: A
     covered = crop.copy()
     covered[rows, left : left + width] = other[rows, start : start + width]
     return covered
+
+
+def border_within(xyxy_px: Array, rng: np.random.Generator, config: AugmentConfig) -> Array:
+    """A border (4,), left top right bottom, of a picture that ends within a box (4,): on one side, or on two that meet."""
+    border = np.array([-np.inf, -np.inf, np.inf, np.inf])
+    across, down = rng.integers(2) * 2, 1 + rng.integers(2) * 2
+    sides = (across, down) if rng.random() < 1 / 3 else (across if rng.random() < 1 / 2 else down,)
+    for side in sides:
+        share, start = rng.uniform(*config.cut_share), side % 2
+        whole = xyxy_px[start + 2] - xyxy_px[start]
+        border[side] = xyxy_px[side] + share * whole * (1 if side < 2 else -1)
+    return border
 
 
 def flip_horizontally(image: Image, xyxy_px: Array, width: int) -> tuple[Image, Array]:

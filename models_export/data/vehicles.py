@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -52,14 +52,31 @@ class Vehicle:
         """What validation tells vehicles apart by."""
         return {"camera": self.camera.id, "weather": self.weather}
 
+    def within(self, border_px: Array) -> Vehicle:
+        """The same vehicle in a picture that ends at a border (4,), left top right bottom: of its pixels' outer edges, px."""
+        low, high = self.patch_origin_px, self.patch_origin_px + np.array(self.patch.shape[1::-1]) / self.patch_scale
+        kept = np.concatenate([np.maximum(border_px[:2], low), np.minimum(border_px[2:], high)])
+        x0, y0, x1, y1 = np.rint((kept - np.tile(low, 2)) * np.tile(self.patch_scale, 2)).astype(int)
+        origin = low + np.array([x0, y0]) / self.patch_scale
+        end = low + np.array([x1, y1]) / self.patch_scale
+        # Pixel centres lie at integers: the last one lies half a pixel before the end.
+        xyxy = np.clip(self.xyxy_px, np.tile(origin + 0.5, 2), np.tile(end - 0.5, 2))
+        azimuth = ray_azimuth(self.camera, np.stack([_middle(self.xyxy_px), _middle(xyxy)]))
+        return replace(
+            self,
+            patch=self.patch[y0:y1, x0:x1],
+            patch_origin_px=origin,
+            xyxy_px=xyxy,
+            alpha=float(wrap_angle(self.alpha + azimuth[0] - azimuth[1])),
+        )
+
     def crop(self, xyxy_px: Array, crop_px: int) -> tuple[NDArray[np.uint8], float, Array]:
         """What the head would see and should say of a box (4,) that is not exact.
 
         Returns the crop (S, S, 3), alpha about that box's centre, and the true edges and tangents (12,), in sides of the crop
         from its middle.
         """
-        centers = np.stack([(self.xyxy_px[:2] + self.xyxy_px[2:]) / 2, (xyxy_px[:2] + xyxy_px[2:]) / 2])
-        azimuth = ray_azimuth(self.camera, centers)
+        azimuth = ray_azimuth(self.camera, np.stack([_middle(self.xyxy_px), _middle(xyxy_px)]))
         alpha = float(wrap_angle(self.alpha + azimuth[0] - azimuth[1]))
         origin = np.tile(self.patch_origin_px, 2)
         in_patch = (np.stack([xyxy_px, self.xyxy_px]) - origin) * np.tile(self.patch_scale, 2) - 0.5
@@ -70,6 +87,11 @@ class Vehicle:
         middle = (np.array([left, top]) + 0.5 * side) / self.patch_scale + self.patch_origin_px
         tangents = (self.tangents_px - TANGENT_DIRECTIONS @ middle) / (side / self.patch_scale.mean())
         return crop, alpha, np.concatenate([edges, tangents])
+
+
+def _middle(xyxy_px: Array) -> Array:
+    middle: Array = (xyxy_px[:2] + xyxy_px[2:]) / 2
+    return middle
 
 
 def vehicles_of(sample: VehicleSample, crop_px: int, max_width: int | None = None) -> list[Vehicle]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from models_export.data.ahead import mapped_ahead
-from models_export.data.augment import NO_AUGMENT, AugmentConfig, hidden_behind, photometric
+from models_export.data.augment import NO_AUGMENT, AugmentConfig, border_within, hidden_behind, photometric
 from models_export.data.detection import VehicleSample
 from models_export.data.vehicles import Vehicle, vehicles_of
 from models_export.losses import likelihood_loss, multibin_loss, places_loss
@@ -28,7 +28,7 @@ JITTER, MAX_JITTER = 0.08, 0.2
 SIZE_WEIGHT, OUTLINE_WEIGHT, PLACES_WEIGHT = 4.0, 2.0, 6.0
 """Of the likelihoods of size and outline, and of the outline's places, over the angle's. At 1 the head learned little more of a
 size than its class's mean; the outline is what the lift takes sizes and places from."""
-CROP_AUGMENT = AugmentConfig(motion_px=4, jpeg_quality=(40, 95), noise_sigma=8.0, night=0.06, fog=0.06, hidden=0.3)
+CROP_AUGMENT = AugmentConfig(motion_px=4, jpeg_quality=(40, 95), noise_sigma=8.0, night=0.06, fog=0.06, hidden=0.3, cut=0.25)
 """Milder than a picture's: a crop is a few dozen pixels of it, and streaks and blocks do not shrink with it."""
 _MIRRORED = [2, 1, 0, 3, *(4 + TANGENT_DEGREES.index((180 - angle) % 360) for angle in TANGENT_DEGREES)]
 _MIRRORED_SIGN = [-1.0, 1.0, -1.0, 1.0, *(1.0,) * len(TANGENT_DEGREES)]
@@ -85,6 +85,8 @@ class MultibinTask:
         means = np.array(self.config.mean_dims_lwh)
         for index in indices:
             vehicle = self.vehicles[index]
+            if rng.random() < self.augment.cut:
+                vehicle = vehicle.within(border_within(vehicle.xyxy_px, rng, self.augment))
             crop, alpha, outline = vehicle.crop(jittered(vehicle.xyxy_px, rng), self.config.crop_px)
             if rng.random() < self.augment.flip:
                 crop, alpha, outline = crop[:, ::-1], -alpha, mirrored_outline(outline)

@@ -6,12 +6,14 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from models_export.data.augment import AugmentConfig, border_within
 from models_export.data.detection import VehicleSample
 from models_export.data.vehicles import Vehicle, vehicles_of
 from models_export.train.multibin import MAX_JITTER, jittered, mirrored_outline
 from service.geometry.boxes import tangents_of
 from service.geometry.camera import Camera, ray_azimuth
 from service.geometry.transforms import Array, pole_camera_pose, wrap_angle
+from service.nets.canvas import PAD_VALUE
 from service.nets.multibin import crop_windows, edges_in_image, tangents_in_image
 
 K = np.array([[300.0, 0.0, 199.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])
@@ -93,3 +95,39 @@ def test_jitter_is_bounded(seed: int) -> None:
     box = np.array([10.0, 10.0, 50.0, 30.0])
     moved = jittered(box, np.random.default_rng(seed))
     assert np.abs(moved - box).max() <= MAX_JITTER * 40.0 + 1e-9
+
+
+@given(seed=st.integers(0, 10_000), side=st.integers(0, 3))
+def test_beyond_a_border_a_crop_is_grey_and_the_outline_goes_on(seed: int, side: int) -> None:
+    rng = np.random.default_rng(seed)
+    vehicle = white_box([100, 80, 160, 120])
+    border = np.array([-np.inf, -np.inf, np.inf, np.inf])
+    border[side] = rng.integers(115, 145) if side % 2 == 0 else rng.integers(90, 110)
+    border[side] -= 0.5
+    cut = vehicle.within(border)
+    crop, alpha, outline = cut.crop(cut.xyxy_px, 96)
+    _, whole_alpha, whole_outline = vehicle.crop(cut.xyxy_px, 96)
+    low_high = [border[side] + 0.5, border[side] - 0.5]
+    assert cut.xyxy_px[side] == low_high[side // 2]
+    np.testing.assert_allclose(np.delete(cut.xyxy_px, side), np.delete(vehicle.xyxy_px, side))
+    np.testing.assert_allclose(outline[4:], whole_outline[4:], atol=1e-9)
+    assert abs(wrap_angle(alpha - whole_alpha)) < 1e-9
+    at = (outline[side] + 0.5) * 96
+    beyond = crop[:, : int(at) - 2] if side == 0 else crop[:, int(at) + 3 :]
+    if side % 2:
+        beyond = crop[: int(at) - 2] if side == 1 else crop[int(at) + 3 :]
+    assert (beyond == PAD_VALUE).all()
+
+
+@given(seed=st.integers(0, 10_000))
+def test_a_border_leaves_a_part_of_the_vehicle(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    box = np.array([100.0, 80.0, 180.0, 130.0])
+    border = border_within(box, rng, AugmentConfig())
+    shown = np.clip(box, np.tile(border[:2], 2), np.tile(border[2:], 2))
+    share = (shown[2:] - shown[:2]) / (box[2:] - box[:2])
+    assert share.min() >= 0.3 - 1e-9
+    assert share.min() < 1
+    assert np.isfinite(border).sum() in (1, 2)
+    assert np.isfinite(border[[0, 2]]).sum() <= 1
+    assert np.isfinite(border[[1, 3]]).sum() <= 1

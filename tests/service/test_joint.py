@@ -129,7 +129,7 @@ def test_a_shifted_picture_counts_as_correlated_edges():
     _, measurements = seen(5, np.random.default_rng(5))
     boxes, terms = lifted(measurements)
     shift = np.linspace(1e-3, 1e-2, 10)
-    loose = replace(terms, shift_sigma=shift, huber=np.full_like(terms.huber, np.inf))
+    loose = replace(terms, shift_sigma=shift, tail=np.full_like(terms.tail, 1e9))
     states = box_states(boxes)
     residual, jacobian = residuals(loose, states)
     equations = normal_equations(loose, states)

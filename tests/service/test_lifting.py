@@ -204,7 +204,7 @@ def some_problem(rng, n, hinged):
         ray=rng.normal(size=(n, 3)),
         depth=rng.uniform(5, 30, n),
         depth_weight=rng.uniform(0.5, 2, n),
-        huber=np.full((n, FIXED_ROWS + 8), np.inf),
+        tail=np.full((n, FIXED_ROWS + 8), 1e9),
     )
 
 
@@ -226,7 +226,7 @@ def test_analytic_jacobian_is_the_derivative(hinged):
 
 def test_gradient_is_that_of_the_robust_cost():
     rng = np.random.default_rng(6)
-    problem = replace(some_problem(rng, 50, False), huber=np.full((50, FIXED_ROWS + 8), 2.0))
+    problem = replace(some_problem(rng, 50, False), tail=np.full((50, FIXED_ROWS + 8), 2.0))
     state = np.c_[rng.normal(size=(50, 3)), rng.uniform(1, 4, (50, 3)), rng.uniform(-3, 3, 50)]
     gradient = normal_equations(problem, state).gradient
     numeric = derivative(lambda x: normal_equations(problem, x).cost, state)
@@ -296,7 +296,7 @@ def test_one_wrong_edge_moves_a_robust_box_less():
     merged = xyxy.copy()
     merged[:, 1] -= 0.5 * (xyxy[:, 3] - xyxy[:, 1])
     robust = errors_m(lift([camera], GroundPlane(), measured(truth, merged)), truth)
-    plain = errors_m(lift([camera], GroundPlane(), measured(truth, merged), LiftSettings(huber_sigmas=1e9)), truth)
+    plain = errors_m(lift([camera], GroundPlane(), measured(truth, merged), LiftSettings(tail_sigmas=1e9)), truth)
     assert np.median(robust) < 0.6 * np.median(plain)
 
 
