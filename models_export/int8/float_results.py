@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from models_export.graphs import GraphWriter, constants, makers
 
 _INT8_MOST = 127
+_COLUMNS = 16
+"""Products have a multiple of as many columns: with others, ONNX Runtime before 1.25 gives garbage on processors with AMX."""
 
 
 def multiply_in_int8(graph: onnx.GraphProto, outputs: Sequence[str]) -> None:
@@ -41,10 +43,16 @@ def _as_product(graph: onnx.GraphProto, layer: onnx.NodeProto, weight: NDArray[n
     added.constant(scale, f"{name}_scale")
     table = added.before(layer, "Squeeze", [stored, added.constant(np.array([2, 3], np.int64))])
     columns = added.before(layer, "Transpose", [table], perm=(1, 0))
-    zero = added.constant(np.zeros(len(scale), np.int8))
-    factors = added.before(layer, "DequantizeLinear", [columns, f"{name}_scale", zero], axis=1)
+    beyond = -len(scale) % _COLUMNS
+    wider = added.before(layer, "Pad", [columns, added.constant(np.array([0, 0, 0, beyond], np.int64))])
+    scales = added.before(layer, "Concat", [f"{name}_scale", added.constant(np.ones(beyond, np.float32))], axis=0)
+    zeros = added.constant(np.zeros(len(scale) + beyond, np.int8))
+    factors = added.before(layer, "DequantizeLinear", [wider, scales, zeros], axis=1)
     cells = added.before(layer, "Transpose", [read], perm=(0, 2, 3, 1))
     product = added.before(layer, "MatMul", [cells, factors])
+    if beyond:
+        span = [added.constant(np.array([number], np.int64)) for number in (0, len(scale), -1)]
+        product = added.before(layer, "Slice", [product, *span])
     if bias:
         product = added.before(layer, "Add", [product, *bias])
     added.before(layer, "Transpose", [product], output, perm=(0, 3, 1, 2))

@@ -16,7 +16,7 @@ from service.nets.pack import Network
 
 SCORE_THRESHOLD = 0.3
 """Boxes of a lower score are dropped."""
-NMS_IOU = 0.55
+NMS_IOU = 0.5
 """Boxes that overlap a better one by more are dropped."""
 
 

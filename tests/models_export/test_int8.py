@@ -129,6 +129,23 @@ def test_a_last_layer_multiplied_in_int8_is_off_by_its_weights_rounding(plain: C
     assert 0 < np.abs(after - before).max() <= 0.5 * step * net.second.in_channels * hidden * 1.05
 
 
+@pytest.mark.parametrize("outputs", [16, 27])
+def test_products_have_whole_blocks_of_columns(plain: Callable[..., onnx.ModelProto], outputs: int) -> None:
+    """ONNX Runtime before 1.25 computes garbage on processors with AMX where they have not."""
+    torch.manual_seed(0)
+    net, images = Reader((3, 3), 2, (1, 1)), pictures(64, 96)
+    net.second = nn.Conv2d(net.second.in_channels, outputs, 1)
+    model = plain(net, images, ("out",))
+    multiply_in_int8(model.graph, ("out",))
+    (product,) = (node for node in model.graph.node if node.op_type == "MatMul")
+    assert run(model, images)[0].shape[1] == outputs
+    del model.graph.output[:]
+    model.graph.output.append(onnx.helper.make_tensor_value_info(product.input[1], onnx.TensorProto.FLOAT, ["a", "b"]))
+    factors = run(model, images)[0]
+    assert factors.shape[1] == 16 * -(-outputs // 16)
+    assert not factors[:, outputs:].any()
+
+
 def test_doubled_cells_are_the_same_bits(plain: Callable[..., onnx.ModelProto]) -> None:
     torch.manual_seed(0)
     net, images = EdgeDetector(DetectorConfig(width=8, blocks=(1, 1, 1, 1), neck=16)), pictures(64, 96)
