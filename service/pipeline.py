@@ -35,7 +35,7 @@ from service.sightings import Sightings
 from service.site import Site
 from service.solver import SolverSettings
 
-CONFIDENCE = Confidence(offset=-4.8, score=1.1, doubt=-3.2, several=-0.9, silent=-0.6)
+CONFIDENCE = Confidence(offset=-5.1, score=1.15, doubt=-3.4, several=-0.85, silent=-0.55)
 """``FusionSettings.confidence`` of a pipeline, fitted on validation scenes (docs: fusion): the score is then about the share of
 such boxes that overlap a vehicle by more than half."""
 TAIL_SIGMAS = 1.0
