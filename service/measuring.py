@@ -19,7 +19,7 @@ from service.nets.detector import edge_sigma
 from service.nets.detector_spec import DetectorSpec
 from service.nets.multibin import UNCERTAIN, Crops, Multibin, MultibinEstimates, MultibinSpec, cut_crops
 
-_ERR_TOGETHER = 1.5
+ERR_TOGETHER = 1.5
 """What a head's sigmas of edges and tangents are multiplied by: each is honest for itself, but twelve readings of one look at a
 vehicle err together, and do not tell as much as twelve looks (validation scenes; docs: lifting)."""
 _MOST_SHIFT = 0.5
@@ -149,7 +149,7 @@ def _tangents(estimates: MultibinEstimates) -> tuple[Array, Array]:
     """Tangents (N, K) and their standard deviations (N, K), px; K is 0 where the head reads none."""
     if estimates.tangents_px is None or estimates.sigma is None:
         return np.zeros((len(estimates.alpha), 0)), np.zeros((len(estimates.alpha), 0))
-    return estimates.tangents_px, _ERR_TOGETHER * estimates.sigma[:, len(UNCERTAIN) :]
+    return estimates.tangents_px, ERR_TOGETHER * estimates.sigma[:, len(UNCERTAIN) :]
 
 
 def _edges(
@@ -163,4 +163,4 @@ def _edges(
     if estimates.xyxy_px is None or estimates.sigma is None:
         small = (seen + 0.5) / scale - 0.5
         return seen, edge_sigma(detector, small, score, cut.any(1)) * scale
-    return np.where(cut, seen, estimates.xyxy_px), _ERR_TOGETHER * estimates.sigma[:, 4 : len(UNCERTAIN)]
+    return np.where(cut, seen, estimates.xyxy_px), ERR_TOGETHER * estimates.sigma[:, 4 : len(UNCERTAIN)]

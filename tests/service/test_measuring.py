@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from service.depth_scale import DepthReadings
 from service.geometry.camera import Camera, yaw_from_alpha
 from service.geometry.transforms import Array, pole_camera_pose
-from service.measuring import Still, cut_detected, measure, refined
+from service.measuring import ERR_TOGETHER, Still, cut_detected, measure, refined
 from service.nets.detections import Detections
 from service.nets.detector_spec import DetectorSpec
 from service.nets.error_model import ErrorModel
@@ -64,11 +64,11 @@ def test_at_one_size_nothing_is_scaled() -> None:
     np.testing.assert_allclose(told.sigma_px, 1.0)
 
 
-def test_a_head_that_reads_edges_is_believed_with_its_own_sigmas() -> None:
+def test_a_head_that_reads_edges_is_believed_with_its_own_sigmas_as_readings_that_err_together() -> None:
     edges = np.array([[201.0, 121.0, 322.0, 199.0]])
     told = measured(INNER, says(edges))
     np.testing.assert_array_equal(told.xyxy_px, edges)
-    np.testing.assert_array_equal(told.sigma_px, SURE[:, 4:])
+    np.testing.assert_array_equal(told.sigma_px, ERR_TOGETHER * SURE[:, 4:])
     np.testing.assert_array_equal(told.sigma_dims, SURE[:, 1:4])
     assert told.sigma_yaw[0] == SURE[0, UNCERTAIN.index("alpha")]
 
