@@ -20,11 +20,11 @@ from benchmarks.scene_grades import grade_of
 from benchmarks.scene_score import CURVE_SCORE, MIN_OVERLAPS, PipelineFactory
 from benchmarks.scene_sets import SceneSets, found, frame_sets, of_counted_class, wanted
 from service.confidence import Confidence, evidence
+from service.fusion import silent_cameras
 from service.geometry.transforms import Array
 from service.odds import log_odds, probability
 from service.pipeline import CONFIDENCE, PipelineSettings, SetResult
 from service.site import Site
-from service.views import whole_in_view
 
 RIGHT_IOU = 0.5
 RIDGE = 1e-4
@@ -77,8 +77,8 @@ def candidates(sets: SceneSets, make: PipelineFactory) -> Candidates:
 def _facts(result: SetResult, site: Site, range_m: float) -> Array:
     """The evidence (M, 4) on a result whose scores are the cameras' means."""
     cameras = [site.camera(camera_id) for camera_id in result.camera_ids]
-    silences = (whole_in_view(result.boxes, cameras, range_m) & ~result.members).sum(1)
-    return evidence(result.boxes, result.members.sum(1), silences.astype(np.float64))
+    silences = silent_cameras(result.boxes, result.members, cameras, range_m)
+    return evidence(result.boxes, result.members.sum(1), silences)
 
 
 def fit(seen: Candidates) -> Confidence:

@@ -119,7 +119,7 @@ def fuse(
     fused, parts, cluster = _fuse_and_merge(single, owner, terms, cluster, settings)
     members = np.zeros((len(fused), len(cameras)), dtype=bool)
     members[parts.row, parts.camera] = True
-    silences = _silent_cameras(fused, members, cameras, settings.view_range_m)
+    silences = silent_cameras(fused, members, cameras, settings.view_range_m)
     score = settings.confidence.of(evidence(fused, members.sum(1), silences))
     order = np.argsort(-score, kind="stable")
     rank = np.argsort(order)
@@ -214,7 +214,7 @@ def _best_per_camera(boxes: Boxes, owner: Index, cluster: Index) -> Index:
     return best
 
 
-def _silent_cameras(fused: Boxes, members: NDArray[np.bool_], cameras: Sequence[Camera], range_m: float) -> Array:
+def silent_cameras(fused: Boxes, members: NDArray[np.bool_], cameras: Sequence[Camera], range_m: float) -> Array:
     """How many cameras (M,) have each box in full view, within range, and do not report it."""
     silent = whole_in_view(fused, cameras, range_m) & ~members
     count: Array = silent.sum(1).astype(np.float64)

@@ -61,14 +61,8 @@ class Vehicle:
         end = low + np.array([x1, y1]) / self.patch_scale
         # Pixel centres lie at integers: the last one lies half a pixel before the end.
         xyxy = np.clip(self.xyxy_px, np.tile(origin + 0.5, 2), np.tile(end - 0.5, 2))
-        azimuth = ray_azimuth(self.camera, np.stack([_middle(self.xyxy_px), _middle(xyxy)]))
-        return replace(
-            self,
-            patch=self.patch[y0:y1, x0:x1],
-            patch_origin_px=origin,
-            xyxy_px=xyxy,
-            alpha=float(wrap_angle(self.alpha + azimuth[0] - azimuth[1])),
-        )
+        patch = self.patch[y0:y1, x0:x1]
+        return replace(self, patch=patch, patch_origin_px=origin, xyxy_px=xyxy, alpha=self._alpha_about(xyxy))
 
     def crop(self, xyxy_px: Array, crop_px: int) -> tuple[NDArray[np.uint8], float, Array]:
         """What the head would see and should say of a box (4,) that is not exact.
@@ -76,8 +70,7 @@ class Vehicle:
         Returns the crop (S, S, 3), alpha about that box's centre, and the true edges and tangents (12,), in sides of the crop
         from its middle.
         """
-        azimuth = ray_azimuth(self.camera, np.stack([_middle(self.xyxy_px), _middle(xyxy_px)]))
-        alpha = float(wrap_angle(self.alpha + azimuth[0] - azimuth[1]))
+        alpha = self._alpha_about(xyxy_px)
         origin = np.tile(self.patch_origin_px, 2)
         in_patch = (np.stack([xyxy_px, self.xyxy_px]) - origin) * np.tile(self.patch_scale, 2) - 0.5
         crop = crop_vehicles(self.patch, in_patch[:1], crop_px)[0]
@@ -87,6 +80,11 @@ class Vehicle:
         middle = (np.array([left, top]) + 0.5 * side) / self.patch_scale + self.patch_origin_px
         tangents = (self.tangents_px - TANGENT_DIRECTIONS @ middle) / (side / self.patch_scale.mean())
         return crop, alpha, np.concatenate([edges, tangents])
+
+    def _alpha_about(self, xyxy_px: Array) -> float:
+        """The heading relative to the ray through another box's centre."""
+        azimuth = ray_azimuth(self.camera, np.stack([_middle(self.xyxy_px), _middle(xyxy_px)]))
+        return float(wrap_angle(self.alpha + azimuth[0] - azimuth[1]))
 
 
 def _middle(xyxy_px: Array) -> Array:
@@ -125,7 +123,7 @@ def _cut(
 ) -> Vehicle:
     """The vehicle in a row of a sample, whose box (4,) and tangents (8,) are those in an image of the camera's size."""
     half = 0.5 * _ROOM * CONTEXT * float((xyxy_px[2:] - xyxy_px[:2]).max())
-    center = (xyxy_px[:2] + xyxy_px[2:]) / 2
+    center = _middle(xyxy_px)
     x0, y0 = np.maximum(np.floor(center - half), 0).astype(int)
     x1, y1 = np.minimum(np.ceil(center + half), image.shape[1::-1]).astype(int)
     patch = image[y0:y1, x0:x1]
