@@ -1,5 +1,6 @@
 # The service with its networks: no compiler, no torch, not root.
 #   docker build -t quadlift . && docker run -p 8000:8000 quadlift
+# Faster on x86-64, and 180 MB larger: docker build --build-arg EXTRAS=openvino -t quadlift .
 
 FROM python:3.11-slim AS build
 WORKDIR /src
@@ -9,8 +10,9 @@ COPY clients clients
 COPY models_export models_export
 COPY benchmarks benchmarks
 RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheels .
+ARG EXTRAS=
 RUN python -m venv /opt/quadlift \
- && /opt/quadlift/bin/pip install --no-cache-dir /wheels/quadlift-*.whl \
+ && /opt/quadlift/bin/pip install --no-cache-dir "$(echo /wheels/quadlift-*.whl)${EXTRAS:+[$EXTRAS]}" \
  && /opt/quadlift/bin/python -c "import importlib.util as u; assert u.find_spec('torch') is None, 'torch came in'"
 
 FROM python:3.11-slim

@@ -170,8 +170,9 @@ def bench_fps(
     """Replay the shipped clip as fast as it goes and compare with a target, 30 sets a second by default."""
     try:
         sets = clip_frame_sets(cameras=cameras, site=load_site(site) if site else None)
-        loaded = load_pack(pack, provider=provider)
-        ours, bare = measure(loaded, sets, seconds, via, workers or usable_cores())
+        workers = workers or usable_cores()
+        loaded = load_pack(pack, provider=provider, concurrent_runs=workers)
+        ours, bare = measure(loaded, sets, seconds, via, workers)
     except (QuadliftError, ClipError) as error:
         console.print(f"[red]{error}[/red]")
         raise typer.Exit(2) from None

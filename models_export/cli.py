@@ -133,7 +133,8 @@ def export_command(
             manifest = export_guided(runs, data, beside or str(out), out, recipe.guided, console)
     except QuadliftError as error:
         raise _failed(error) from None
-    size = sum((out / entry.file).stat().st_size for entry in manifest.networks.values())
+    files = [file for entry in manifest.networks.values() for file in (entry, entry.openvino) if file is not None]
+    size = sum((out / file.file).stat().st_size for file in files)
     console.print(f"pack '{manifest.name}' in {out}: {size / 1e6:.1f} MB")
 
 

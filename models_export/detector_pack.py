@@ -31,11 +31,7 @@ def write_detector_pack(
 
     licence, origin, scores: of the detector.
     """
-    others = [
-        Exported(name, (base.path / entry.file).read_bytes(), entry.precision, entry.parameters)
-        for name, entry in base.manifest.networks.items()
-        if name != detector.name
-    ]
+    others = [Exported.of_pack(base, name) for name in base.manifest.networks if name != detector.name]
     known = {name: value for name, value in base.manifest.scores.items() if name != detector.name}
     from_base = {"name": base.manifest.name, "version": base.manifest.version, "training": base.manifest.training}
     return write_pack(

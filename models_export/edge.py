@@ -47,6 +47,7 @@ def _detector(config: DetectorConfig) -> NetworkRecipe:
         load_foreign=load_nanodet,
         real=RealData.detection,
         precision="int8",
+        openvino=True,
     )
 
 

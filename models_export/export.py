@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.export import Dim
 
 from service.nets.canvas import ALIGN_PX
-from service.nets.pack import METADATA_KEY, Manifest, NetworkEntry, open_network
+from service.nets.pack import METADATA_KEY, Manifest, NetworkEntry, Pack, StoredFile, open_network
 
 OPSET = 20
 """ONNX operator set of every exported graph; ONNX Runtime runs it since 1.17."""
@@ -32,8 +32,18 @@ class Exported:
 
     name: str
     model: bytes
+    """In the form for ONNX Runtime."""
     precision: str
     parameters: int
+    openvino: bytes | None = None
+    """The same network in the form for OpenVINO, where that is worth it."""
+
+    @staticmethod
+    def of_pack(pack: Pack, name: str) -> Exported:
+        """A network of a pack as it is."""
+        entry = pack.manifest.networks[name]
+        openvino = None if entry.openvino is None else (pack.path / entry.openvino.file).read_bytes()
+        return Exported(name, (pack.path / entry.file).read_bytes(), entry.precision, entry.parameters, openvino)
 
 
 def to_onnx(net: nn.Module, name: str, example_hw: tuple[int, int], outputs: Sequence[str], *, dynamic_hw: bool) -> bytes:
@@ -104,14 +114,16 @@ def write_pack(
     out.mkdir(parents=True, exist_ok=True)
     entries = {}
     for network in exported:
-        open_network(network.name, network.model)
-        path = out / f"{network.name}.onnx"
-        path.write_bytes(network.model)
+        stored = _store(out / f"{network.name}.onnx", network.name, network.model)
+        openvino = None
+        if network.openvino is not None:
+            openvino = _store(out / f"{network.name}.openvino.onnx", network.name, network.openvino)
         entries[network.name] = NetworkEntry(
-            file=path.name,
-            sha256=hashlib.sha256(network.model).hexdigest(),
+            file=stored.file,
+            sha256=stored.sha256,
             precision=network.precision,
             parameters=network.parameters,
+            openvino=openvino,
         )
     manifest = Manifest(
         name=name,
@@ -124,6 +136,12 @@ def write_pack(
     )
     (out / "manifest.json").write_text(json.dumps(manifest.model_dump(), indent=1) + "\n", encoding="utf-8")
     return manifest
+
+
+def _store(path: Path, name: str, model: bytes) -> StoredFile:
+    open_network(name, model)
+    path.write_bytes(model)
+    return StoredFile(file=path.name, sha256=hashlib.sha256(model).hexdigest())
 
 
 def _strip_source_paths(model: onnx.ModelProto) -> None:

@@ -146,11 +146,7 @@ def real_inputs(spec: GuidedSpec, frames: Sequence[GuidedFrame], *, cut: bool = 
 def add_to_pack(base: Pack, out: Path, added: Exported, provenance: dict[str, Any], scores: dict[str, Any]) -> Manifest:
     """Write the pack ``base`` with one network more to ``out``, which may be its own folder."""
     old = base.manifest
-    kept = [
-        Exported(name, (base.path / entry.file).read_bytes(), entry.precision, entry.parameters)
-        for name, entry in old.networks.items()
-        if name != added.name
-    ]
+    kept = [Exported.of_pack(base, name) for name in old.networks if name != added.name]
     networks = {**old.training.get("networks", {}), added.name: provenance}
     return write_pack(
         out, [*kept, added], name=old.name, version=old.version, classes=old.classes,

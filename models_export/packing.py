@@ -18,7 +18,7 @@ from models_export.data.samples import Sample, split_scenes
 from models_export.data.vehicles import vehicles_of
 from models_export.export import Exported, fixed_batch, to_onnx, with_metadata, write_pack
 from models_export.half import to_half
-from models_export.int8.quantize import quantize
+from models_export.int8.quantize import for_onnxruntime, quantize
 from models_export.metadata import UNMEASURED
 from models_export.nets.blocks import parameter_count
 from models_export.recipe import NetworkRecipe, PackRecipe, Precision, resolved_config
@@ -128,6 +128,8 @@ class _Draft:
     metadata: dict[str, Any]
     precision: Precision
     parameters: int
+    openvino: bytes | None
+    """The same in the form for OpenVINO, where the recipe wants one."""
 
     def open(self) -> Network:
         """The network as the service would open it."""
@@ -201,9 +203,7 @@ class _Job:
         if self.base is None or self._checkpoint(name).is_file():
             return None
         manifest = self.base.manifest
-        entry = manifest.networks[name]
-        data = (self.base.path / entry.file).read_bytes()
-        self.exported.append(Exported(name, data, entry.precision, entry.parameters))
+        self.exported.append(Exported.of_pack(self.base, name))
         self.scores[name] = manifest.scores.get(name, {})
         self.provenance[name] = training_of(manifest, name)
         return self.base.networks[name]
@@ -239,14 +239,20 @@ class _Job:
             worst["fp16"] = require_parity(net, open_network(name, with_metadata(model, {})), inputs, precision)
         elif precision == "int8":
             model = quantize(model, calibration, keep_float=network.outputs)
+        openvino = model if network.openvino else None
+        if precision == "int8":
+            model = for_onnxruntime(model, keep_float=network.outputs)
         if self.options.batch is not None:
             model = fixed_batch(model, self.options.batch)
+            openvino = None if openvino is None else fixed_batch(openvino, self.options.batch)
         self.scores[name] = {"parity_with_torch": float(f"{worst[precision if precision in worst else 'fp32']:.2e}")}
-        return _Draft(name, model, network.metadata(config), precision, parameter_count(net))
+        return _Draft(name, model, network.metadata(config), precision, parameter_count(net), openvino)
 
     def _finish(self, draft: _Draft, measured: dict[str, Any], scores: dict[str, Any]) -> None:
-        model = with_metadata(draft.model, draft.metadata | measured)
-        self.exported.append(Exported(draft.name, model, draft.precision, draft.parameters))
+        metadata = draft.metadata | measured
+        model = with_metadata(draft.model, metadata)
+        openvino = None if draft.openvino is None else with_metadata(draft.openvino, metadata)
+        self.exported.append(Exported(draft.name, model, draft.precision, draft.parameters, openvino))
         self.scores[draft.name] |= scores
 
     def _calibration_canvases(self, fit: InputFit) -> list[Images]:

@@ -63,6 +63,8 @@ class NetworkRecipe:
     """Height and width of the only input that it takes, px: frames are scaled to fit. None: any multiple of 32 px."""
     precision: Precision = "fp32"
     """In which it is exported unless asked otherwise."""
+    openvino: bool = False
+    """Whether OpenVINO, where it is installed, computes it rather than ONNX Runtime: where that was measured to be faster."""
     load_pretrained: Callable[[Any, Path], object] = load_checkpoint
     """Puts the weights of a user's file or folder into the network: what ``--init`` names."""
     load_foreign: Callable[[Task, Path], dict[str, Any]] | None = None

@@ -6,11 +6,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
-import onnxruntime as ort
-
 from service.logs import configure_logging
 from service.nets.pack import load_pack
-from service.nets.providers import is_gpu
+from service.nets.providers import is_gpu, offered
 from service.pipeline import Pipeline, PipelineSettings
 from service.scheduler import FrameSetRunner
 from service.settings import Settings
@@ -24,7 +22,12 @@ def load_pipeline(settings: Settings) -> Pipeline:
     options = PipelineSettings(hard_mode=settings.hard_mode, detector_width=settings.detector_width)
     if (threshold := settings.score_threshold) is not None:
         options = replace(options, score_threshold=threshold, min_fused_score=threshold)
-    pack = load_pack(settings.pack, provider=settings.provider, intra_op_threads=settings.intra_op_threads)
+    pack = load_pack(
+        settings.pack,
+        provider=settings.provider,
+        intra_op_threads=settings.intra_op_threads,
+        concurrent_runs=settings.workers,
+    )
     return Pipeline(pack, options)
 
 
@@ -33,7 +36,7 @@ def make_runner(settings: Settings, load: Load = load_pipeline) -> FrameSetRunne
 
     load: makes the pipeline; a function of a module, since worker processes look it up by its name.
     """
-    on_gpu = settings.worker_kind == "auto" and is_gpu(settings.provider, ort.get_available_providers())
+    on_gpu = settings.worker_kind == "auto" and is_gpu(settings.provider, offered())
     if settings.worker_kind == "thread" or on_gpu:
         return load(settings)
     return ProcessRunner(partial(_load_in_process, settings, load), settings.workers)
@@ -41,4 +44,5 @@ def make_runner(settings: Settings, load: Load = load_pipeline) -> FrameSetRunne
 
 def _load_in_process(settings: Settings, load: Load) -> FrameSetRunner:
     configure_logging(settings.log_format, settings.log_level)
-    return load(settings)
+    # A process runs one set at a time.
+    return load(settings.model_copy(update={"workers": 1}))

@@ -42,7 +42,7 @@ class Settings(BaseSettings):
     """Networks to run: the name of a shipped pack, or the path of a pack's folder."""
     provider: Provider = "auto"
     """What the networks compute on: ``cpu``, ``cuda``, ``tensorrt``, ``openvino``; ``auto`` takes CUDA, then OpenVINO, then the
-    CPU, whichever the installed onnxruntime has. One given by name must be there and must start."""
+    CPU, whichever is installed. One given by name must be there and must start."""
     data_dir: Path | None = None
     """Folder that keeps the sites across restarts. Unset: sites live in memory only."""
     sites: tuple[Path, ...] = ()

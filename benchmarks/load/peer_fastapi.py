@@ -28,11 +28,12 @@ THREADS = "PEER_THREADS"
 
 def create_app() -> FastAPI:
     """The app, for uvicorn."""
-    pool = ThreadPoolExecutor(int(os.environ[THREADS]))
+    threads = int(os.environ[THREADS])
+    pool = ThreadPoolExecutor(threads)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        app.state.model = await asyncio.to_thread(PeerModel)
+        app.state.model = await asyncio.to_thread(PeerModel, threads)
         yield
         pool.shutdown()
 

@@ -28,11 +28,14 @@ SITE_FILE = "PEER_SITE_FILE"
 class PeerModel:
     """The networks of the default pack, warm, for one site. Thread-safe."""
 
-    def __init__(self) -> None:
-        """Load the site that ``PEER_SITE_FILE`` names. Raises QuadliftError, KeyError when there is none."""
-        settings = Settings(intra_op_threads=1)
+    def __init__(self, threads: int = 1) -> None:
+        """For so many threads, and the site that ``PEER_SITE_FILE`` names.
+
+        Raises QuadliftError, KeyError when there is none.
+        """
+        settings = Settings()
         self._site = load_site(Path(os.environ[SITE_FILE]))
-        pack = load_pack(settings.pack, provider=settings.provider, intra_op_threads=settings.intra_op_threads)
+        pack = load_pack(settings.pack, provider=settings.provider, intra_op_threads=1, concurrent_runs=threads)
         self._pipeline = Pipeline(pack)
         self._pipeline.warm_up()
         self._sequences = itertools.count(1)

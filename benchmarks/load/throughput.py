@@ -60,7 +60,7 @@ async def measure_throughput(seconds: float) -> dict[str, Any]:
     """The figures of so many seconds, all ways together. Raises QuadliftError, LocalServiceError,
     GeneratorError, LoadError."""
     workers, sets = usable_cores(), clip_frame_sets()
-    pack = load_pack("edge")
+    pack = load_pack("edge", concurrent_runs=workers)
     pipeline = Pipeline(pack)
     pipeline.warm_up()
     bare, clip = BareLoop(pipeline, sets), open_clip()

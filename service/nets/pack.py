@@ -1,7 +1,8 @@
 """A pack: a folder of ONNX networks with a ``manifest.json``, checked before anything of it runs.
 
 A network's normalisation lies inside its graph; sizes and priors lie in its ONNX metadata under the key ``quadlift`` as
-JSON. So the ONNX file and its SHA-256 in the manifest are all that a pack is.
+JSON. So the ONNX file and its SHA-256 in the manifest are all that a pack is. A network may lie in a pack twice: what one
+runtime computes fastest, another may not.
 """
 
 from __future__ import annotations
@@ -9,10 +10,10 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 import onnxruntime as ort
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from service.errors import PackError
-from service.nets.providers import Choice, Provider, choose, session_providers, settled
+from service.nets.providers import Choice, Provider, choose, offered, session_providers, settled
 
 logger = logging.getLogger(__name__)
 
@@ -32,16 +33,23 @@ _ON_CPU = Choice("cpu", True)
 _EXTERNAL_DATA_MARK = b"\x0a\x08location"
 
 
-class NetworkEntry(BaseModel):
-    """One network of a pack."""
+class StoredFile(BaseModel):
+    """A file of a pack."""
 
     model_config = ConfigDict(extra="forbid")
 
     file: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*\.onnx$")]
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class NetworkEntry(StoredFile):
+    """One network of a pack; the file is in the form for ONNX Runtime."""
+
     precision: str
     """fp32, fp16 or int8."""
     parameters: Annotated[int, Field(ge=0)]
+    openvino: StoredFile | None = None
+    """The same network in the form for OpenVINO; None where that is not worth it: ONNX Runtime computes it then."""
 
 
 class Manifest(BaseModel):
@@ -60,12 +68,22 @@ class Manifest(BaseModel):
     """Validation scores of the networks, by network."""
 
 
+class Session(Protocol):
+    """What is needed of ``onnxruntime.InferenceSession``."""
+
+    def get_inputs(self) -> Sequence[Any]:
+        """The graph's inputs, each with its ``name`` and its ``shape``, of which open sizes are no integers."""
+
+    def run(self, _: None, feeds: dict[str, NDArray[Any]]) -> list[NDArray[np.float32]]:
+        """All outputs for inputs by name."""
+
+
 @dataclass(frozen=True, eq=False)
 class Network:
-    """One ONNX Runtime session and the metadata of its file. Safe to run from several threads at once."""
+    """A network that a runtime has loaded, and the metadata of its file. Safe to run from several threads at once."""
 
     name: str
-    session: ort.InferenceSession
+    session: Session
     metadata: dict[str, Any]
     provider: Provider = "cpu"
     """What it computes on."""
@@ -88,8 +106,7 @@ class Network:
 
     def _run(self, batch: Sequence[NDArray[Any]]) -> list[NDArray[np.float32]]:
         names = [entry.name for entry in self.session.get_inputs()]
-        outputs: list[NDArray[np.float32]] = self.session.run(None, dict(zip(names, batch, strict=True)))
-        return outputs
+        return self.session.run(None, dict(zip(names, batch, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,23 +136,38 @@ def resolve_pack(name_or_path: str) -> Path:
     )
 
 
-def load_pack(name_or_path: str, *, provider: Provider = "auto", intra_op_threads: int = 1) -> Pack:
+def load_pack(name_or_path: str, *, provider: Provider = "auto", intra_op_threads: int = 1, concurrent_runs: int = 1) -> Pack:
     """Check and load a pack.
 
-    provider: what to compute on; one asked for by name must be there, ``auto`` takes the best there is.
+    provider: what to compute on; one asked for by name must be there, ``auto`` takes the best there is. With OpenVINO, networks
+    of which the pack has no form for it stay with ONNX Runtime.
     intra_op_threads: threads that one network run may use. With one, every thread that calls ``run`` works on its own,
-    and workers scale with cores.
+    and workers scale with cores. concurrent_runs: how many will at the same time; OpenVINO lets more wait.
 
     Raises PackError when the manifest is malformed, or a file is missing, altered, or keeps tensors outside itself, or the
-    provider does not start; InputError when ONNX Runtime does not offer it.
+    provider does not start; InputError when it is not installed.
     """
-    choice = choose(provider, ort.get_available_providers())
+    choice = choose(provider, offered())
     folder = resolve_pack(name_or_path)
     manifest = read_manifest(folder / "manifest.json")
     for name in REQUIRED_NETWORKS:
         if name not in manifest.networks:
             raise PackError(f"no network '{name}'.", field=f"{folder.name}/manifest.json", remedy="Export the pack again.")
-    networks = {name: _load_network(folder, name, entry, intra_op_threads, choice) for name, entry in manifest.networks.items()}
+    if choice.provider == "openvino" and not any(entry.openvino for entry in manifest.networks.values()):
+        if choice.is_required:
+            remedy = "Export it with int8 networks, or set 'auto'."
+            raise PackError("no network has a form for OpenVINO.", field=f"{folder.name}/manifest.json", remedy=remedy)
+        choice = _ON_CPU
+    networks = {}
+    for name, entry in manifest.networks.items():
+        model = _read_file(folder, entry)
+        form = None if entry.openvino is None else _read_file(folder, entry.openvino)
+        if choice.provider != "openvino":
+            networks[name] = open_network(name, model, intra_op_threads, choice)
+        elif form is None:
+            networks[name] = open_network(name, model, intra_op_threads)
+        else:
+            networks[name] = open_with_openvino(name, form, intra_op_threads, concurrent_runs)
     pack = Pack(folder, manifest, networks)
     logger.info("pack %s runs on %s (asked for: %s)", manifest.name, pack.provider, provider)
     return pack
@@ -157,24 +189,46 @@ def open_network(name: str, model: bytes, intra_op_threads: int = 1, choice: Cho
 
     Raises PackError when it is no self-contained Quadlift network, or the provider does not start.
     """
+    _require_self_contained(name, model)
+    try:
+        providers = session_providers(choice, ort.get_available_providers())
+        session = ort.InferenceSession(model, session_options(intra_op_threads), providers=providers)
+    except Exception as error:  # ONNX Runtime raises a dozen unrelated types
+        raise PackError(f"ONNX Runtime cannot load it: {error}", field=name, remedy="Export the pack again.") from error
+    metadata = _own_metadata(name, session.get_modelmeta().custom_metadata_map)
+    return Network(name, session, metadata, settled(choice, session.get_providers(), name))
+
+
+def open_with_openvino(name: str, model: bytes, intra_op_threads: int, concurrent_runs: int) -> Network:
+    """A network from the bytes of an ONNX file, computed by OpenVINO. Raises PackError as :func:`open_network` does."""
+    # Imported here: an optional dependency, and large.
+    from service.nets.openvino_session import OpenVinoSession
+
+    _require_self_contained(name, model)
+    try:
+        session = OpenVinoSession(model, intra_op_threads, concurrent_runs)
+    except RuntimeError as error:
+        raise PackError(f"OpenVINO cannot load it: {error}", field=name, remedy="Set the provider to 'cpu'.") from error
+    return Network(name, session, _own_metadata(name, session.metadata), "openvino")
+
+
+def _require_self_contained(name: str, model: bytes) -> None:
     if _EXTERNAL_DATA_MARK in model:
         raise PackError(
             "the file keeps tensors outside itself (external data).",
             field=name,
             remedy="Save the model as one file; a pack vouches for every byte that it loads.",
         )
+
+
+def _own_metadata(name: str, stored: Mapping[str, str]) -> dict[str, Any]:
     try:
-        providers = session_providers(choice, ort.get_available_providers(), intra_op_threads)
-        session = ort.InferenceSession(model, session_options(intra_op_threads), providers=providers)
-    except Exception as error:  # ONNX Runtime raises a dozen unrelated types
-        raise PackError(f"ONNX Runtime cannot load it: {error}", field=name, remedy="Export the pack again.") from error
-    try:
-        metadata = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
+        metadata: dict[str, Any] = json.loads(stored[METADATA_KEY])
     except (KeyError, json.JSONDecodeError) as error:
         raise PackError(
             f"no '{METADATA_KEY}' metadata.", field=name, remedy="Export the network with `quadlift export`."
         ) from error
-    return Network(name, session, metadata, settled(choice, session.get_providers(), name))
+    return metadata
 
 
 def read_manifest(path: Path) -> Manifest:
@@ -187,7 +241,7 @@ def read_manifest(path: Path) -> Manifest:
         raise PackError(f"{where}: {first['msg']}.", field=str(path), remedy="Export the pack again.") from None
 
 
-def _load_network(folder: Path, name: str, entry: NetworkEntry, intra_op_threads: int, choice: Choice) -> Network:
+def _read_file(folder: Path, entry: StoredFile) -> bytes:
     path = folder / entry.file
     try:
         model = path.read_bytes()
@@ -200,4 +254,4 @@ def _load_network(folder: Path, name: str, entry: NetworkEntry, intra_op_threads
             field=str(path),
             remedy="The file was altered or damaged: install or export the pack again.",
         )
-    return open_network(name, model, intra_op_threads, choice)
+    return model

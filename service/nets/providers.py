@@ -1,7 +1,8 @@
-"""Execution providers: what ONNX Runtime computes on, chosen by a setting and checked after the fact.
+"""Providers: what computes the networks, chosen by a setting and checked after the fact.
 
-ONNX Runtime lists a provider when it was built with it, and falls back to the next one without an error when the provider's
-libraries or its device are missing. So what a session really got is compared with what was chosen.
+All are ONNX Runtime's execution providers but OpenVINO, which is a runtime of its own. ONNX Runtime lists a provider when it
+was built with it, and falls back to the next one without an error when the provider's libraries or its device are missing. So
+what a session really got is compared with what was chosen.
 """
 
 from __future__ import annotations
@@ -9,7 +10,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Literal, get_args
+
+import onnxruntime as ort
 
 from service.errors import InputError, PackError
 
@@ -18,13 +22,14 @@ logger = logging.getLogger(__name__)
 Provider = Literal["auto", "cpu", "cuda", "tensorrt", "openvino"]
 PROVIDERS: tuple[Provider, ...] = get_args(Provider)
 _CPU = "CPUExecutionProvider"
+_OPENVINO = "openvino"
 _RUNTIME_NAMES: dict[Provider, str] = {
     "cpu": _CPU,
     "cuda": "CUDAExecutionProvider",
     "tensorrt": "TensorrtExecutionProvider",
-    "openvino": "OpenVINOExecutionProvider",
+    "openvino": _OPENVINO,
 }
-_FALLBACKS: dict[Provider, tuple[Provider, ...]] = {"tensorrt": ("cuda", "cpu"), "cuda": ("cpu",), "openvino": ("cpu",)}
+_FALLBACKS: dict[Provider, tuple[Provider, ...]] = {"tensorrt": ("cuda", "cpu"), "cuda": ("cpu",)}
 """Who runs what a provider cannot, in this order."""
 AUTO_ORDER: tuple[Provider, ...] = ("cuda", "openvino", "cpu")
 """What ``auto`` tries. TensorRT is not among them: it builds its engines for minutes, so it runs only where it is asked for."""
@@ -40,8 +45,13 @@ class Choice:
     """It was asked for by name: another one will not do."""
 
 
+def offered() -> list[str]:
+    """What is installed: the providers that ONNX Runtime was built with, by its names, and OpenVINO."""
+    return [*ort.get_available_providers(), *([_OPENVINO] if find_spec(_OPENVINO) else [])]
+
+
 def choose(asked: Provider, offered: Sequence[str]) -> Choice:
-    """The provider for a setting, among ``offered`` (``onnxruntime.get_available_providers()``).
+    """The provider for a setting, among those ``offered``.
 
     Raises InputError, naming what there is, when one is asked for that is not offered.
     """
@@ -49,9 +59,9 @@ def choose(asked: Provider, offered: Sequence[str]) -> Choice:
         return Choice(next((name for name in AUTO_ORDER if _RUNTIME_NAMES[name] in offered), "cpu"), False)
     if _RUNTIME_NAMES[asked] not in offered:
         raise InputError(
-            f"'{asked}' is not offered by the installed onnxruntime; it has {', '.join(_short_names(offered))}.",
+            f"'{asked}' is not installed; there is {', '.join(_short_names(offered))}.",
             field="provider",
-            remedy="Install the build of onnxruntime that has it (onnxruntime-gpu, onnxruntime-openvino), or set 'auto'.",
+            remedy="Install onnxruntime-gpu in place of onnxruntime, or quadlift[openvino], or set 'auto'.",
         )
     return Choice(asked, True)
 
@@ -61,11 +71,11 @@ def is_gpu(asked: Provider, offered: Sequence[str]) -> bool:
     return choose(asked, offered).provider in ("cuda", "tensorrt")
 
 
-def session_providers(choice: Choice, offered: Sequence[str], intra_op_threads: int) -> list[tuple[str, dict[str, str]]]:
-    """Providers with options for a session, best first, as ONNX Runtime takes them."""
+def session_providers(choice: Choice, offered: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
+    """Providers with options for a session of ONNX Runtime, best first, as it takes them."""
     names = [choice.provider, *_FALLBACKS.get(choice.provider, ())]
     found = [name for name in names if _RUNTIME_NAMES[name] in offered]
-    return [(_RUNTIME_NAMES[name], _options(name, intra_op_threads)) for name in found]
+    return [(_RUNTIME_NAMES[name], _options(name)) for name in found]
 
 
 def settled(choice: Choice, running: Sequence[str], network: str) -> Provider:
@@ -84,13 +94,10 @@ def settled(choice: Choice, running: Sequence[str], network: str) -> Provider:
     return next(name for name, theirs in _RUNTIME_NAMES.items() if theirs == running[0])
 
 
-def _options(provider: Provider, intra_op_threads: int) -> dict[str, str]:
+def _options(provider: Provider) -> dict[str, str]:
     if provider == "cuda":
         # The default tries every algorithm anew for each batch size, of which a site with cameras that come and go has many.
         return {"cudnn_conv_algo_search": "HEURISTIC"}
-    if provider == "openvino":
-        # Workers scale with cores; threads inside a network would only fight them.
-        return {"num_of_threads": str(intra_op_threads)}
     return {}
 
 

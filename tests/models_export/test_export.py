@@ -12,7 +12,7 @@ import torch
 
 from models_export.export import Exported, fixed_batch, to_onnx, with_metadata, write_pack
 from models_export.half import to_half
-from models_export.int8.quantize import quantize
+from models_export.int8.quantize import for_onnxruntime, quantize
 from models_export.nets.depth import DepthConfig, EdgeDepth
 from models_export.nets.detector import DetectorConfig, EdgeDetector
 from models_export.nets.multibin import EdgeMultibin, MultibinConfig
@@ -89,7 +89,7 @@ def test_metadata_is_replaced_not_added(detector: tuple[EdgeDetector, bytes]) ->
 def test_int8_is_smaller_and_near(detector: tuple[EdgeDetector, bytes]) -> None:
     net, model = detector
     batches = [street_like(96, 160)]
-    small = with_metadata(quantize(model, batches, keep_float=HEADS), METADATA)
+    small = with_metadata(for_onnxruntime(quantize(model, batches, keep_float=HEADS), HEADS), METADATA)
     types = {node.op_type for node in onnx.load_from_string(small).graph.node}
     assert "QuantizeLinear" in types
     assert len(small) < len(model)
@@ -141,7 +141,10 @@ def test_a_fixed_batch_serves_any_number_of_images(detector: tuple[EdgeDetector,
 def test_a_fixed_batch_of_quantized_and_half_models(detector: tuple[EdgeDetector, bytes]) -> None:
     net, model = detector
     batches = [street_like(96, 160)]
-    for lowered in (with_metadata(quantize(model, batches, keep_float=HEADS), METADATA), to_half(model)):
+    for lowered in (
+        with_metadata(for_onnxruntime(quantize(model, batches, keep_float=HEADS), HEADS), METADATA),
+        to_half(model),
+    ):
         network = open_network("detector", fixed_batch(lowered, 3))
         assert network.session.get_inputs()[0].shape[0] == 3
         assert parity(net, network, batches) < 0.2

@@ -12,7 +12,7 @@ from torch import nn
 
 from models_export.data.samples import Sample
 from models_export.export import to_onnx, with_metadata
-from models_export.int8.quantize import quantize
+from models_export.int8.quantize import for_onnxruntime, quantize
 from models_export.metadata import detector_metadata
 from models_export.nets.detector import DetectorConfig
 from models_export.train.detector import DetectorTask
@@ -41,7 +41,7 @@ def _trained(samples: list[Sample]) -> DetectorTask:
 def _file(task: DetectorTask, path: Path, *, int8: bool) -> Path:
     model = to_onnx(task.net, "detector", (96, 160), HEADS, dynamic_hw=True)
     if int8:
-        model = quantize(model, [_pictures(task)], keep_float=HEADS)
+        model = for_onnxruntime(quantize(model, [_pictures(task)], keep_float=HEADS), HEADS)
     path.write_bytes(with_metadata(model, {**detector_metadata(task.config), "anchors_px": ANCHORS}))
     return path
 

@@ -65,7 +65,7 @@ def test_external_data_is_refused(pack_copy: Path) -> None:
     onnx.save(model, path, save_as_external_data=True, all_tensors_to_one_file=True, location="weights.bin", size_threshold=0)
     edit_manifest(pack_copy, sha256=hashlib.sha256(path.read_bytes()).hexdigest())
     with pytest.raises(PackError, match="external data"):
-        load_pack(str(pack_copy))
+        load_pack(str(pack_copy), provider="cpu")
 
 
 def test_a_file_that_is_no_model_is_refused(pack_copy: Path) -> None:
@@ -75,7 +75,7 @@ def test_a_file_that_is_no_model_is_refused(pack_copy: Path) -> None:
     path.write_bytes(b"not a network")
     edit_manifest(pack_copy, sha256=hashlib.sha256(path.read_bytes()).hexdigest())
     with pytest.raises(PackError, match="cannot load it"):
-        load_pack(str(pack_copy))
+        load_pack(str(pack_copy), provider="cpu")
 
 
 def test_a_manifest_that_leads_out_of_its_folder_is_refused(pack_copy: Path) -> None:
