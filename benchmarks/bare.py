@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.frames import FrameSet
-from service.measuring import cut_detected, second_looks
 from service.nets.canvas import Canvases
 from service.pipeline import Pipeline
+from service.stills import DetectedVehicles
 
 PREPARE_S = 10.0
 """Seconds after which no further set is prepared."""
@@ -75,7 +75,7 @@ class BareLoop:
         images = [still.small for still in stills]
         found = self._pipeline.detector.detect(images, score_threshold=settings.score_threshold, nms_iou=settings.nms_iou)
         head = self._pipeline.multibin
-        first = cut_detected(stills, found, head.spec.crop_px)
-        estimates = head.estimate(first, np.concatenate([own.cls for own in found]))
-        _, second = second_looks(stills, found, estimates, head.spec.crop_px, settings.refine_shift)
+        detected = DetectedVehicles.of(stills, found)
+        first = detected.crops(head.spec.crop_px)
+        _, second = detected.second_looks(head.estimate(first, detected.cls), head.spec.crop_px, settings.refine_shift)
         return _Work(frame_set, tuple(crops.pixels for crops in (first, second) if len(crops)))

@@ -23,12 +23,12 @@ from service.geometry.ground import Ground
 from service.geometry.transforms import Array
 from service.guided_boxes import join, on_the_road, suppress_bev, world_boxes
 from service.hardness import HardnessSettings, hardness_of
-from service.measuring import Still
 from service.nets.depth import InverseDepth
 from service.nets.detections import Detections
 from service.nets.guided import GuidedDetector, guide_maps, metric_map
 from service.nets.pack import Pack
 from service.site import Site
+from service.stills import Still
 
 logger = logging.getLogger(__name__)
 

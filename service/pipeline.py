@@ -22,18 +22,19 @@ from service.geometry.camera import Camera, UInt8Image
 from service.guidance import Guidance, GuidanceSettings, HardMode, View
 from service.lifting import LiftSettings, lift_with_terms
 from service.measurements import Measurements
-from service.measuring import Still, cut_detected, measure, refined
+from service.measuring import measure, read_vehicles
 from service.nets.canvas import Canvases, canvas_size
 from service.nets.depth import DepthNet, InverseDepth
 from service.nets.detections import Detections
 from service.nets.detector import NMS_IOU, SCORE_THRESHOLD, Detector
-from service.nets.multibin import Multibin, MultibinEstimates, cut_crops
+from service.nets.multibin import Multibin, cut_crops
 from service.nets.pack import Pack
 from service.paper_fusion import PaperFusionSettings, fuse_paper
 from service.residuals import BoxProblem
 from service.sightings import Sightings
 from service.site import Site
 from service.solver import SolverSettings
+from service.stills import DetectedVehicles, Still
 
 CONFIDENCE = Confidence(offset=-5.1, score=1.15, doubt=-3.4, several=-0.85, silent=-0.55)
 """``FusionSettings.confidence`` of a pipeline, fitted on validation scenes (docs: fusion): the score is then about the share of
@@ -159,13 +160,14 @@ class Pipeline:
         with _timed(timing, "detect"):
             canvases = Canvases([still.small for still in stills])
             found = self._detect(canvases)
+        detected = DetectedVehicles.of(stills, found)
         with _timed(timing, "orient"):
-            estimates = self._orient(stills, found)
+            estimates = read_vehicles(detected, self.multibin, self.settings.refine_shift)
         with _timed(timing, "depth"):
             maps = self._metric_maps(frame_set, stills, canvases)
             readings = self._read_depth(maps, found)
         with _timed(timing, "lift"):
-            measured = measure(stills, found, estimates, readings, self.detector.spec, self.multibin.spec)
+            measured = measure(detected, estimates, readings, self.detector.spec, self.multibin.spec)
             lifted, terms = self._lift(cameras, frame_set.site, measured)
             index = measured.camera_index
         hard: frozenset[str] = frozenset()
@@ -266,11 +268,6 @@ class Pipeline:
     def _detect(self, canvases: Canvases) -> list[Detections]:
         batches, settings = canvases.batches(self.detector.fit), self.settings
         return self.detector.detect_on(batches, score_threshold=settings.score_threshold, nms_iou=settings.nms_iou)
-
-    def _orient(self, stills: list[Still], found: list[Detections]) -> MultibinEstimates:
-        crops = cut_detected(stills, found, self.multibin.spec.crop_px)
-        estimates = self.multibin.estimate(crops, np.concatenate([detections.cls for detections in found]))
-        return refined(stills, found, estimates, self.multibin, self.settings.refine_shift)
 
     def _metric_maps(
         self, frame_set: FrameSet, stills: list[Still], canvases: Canvases

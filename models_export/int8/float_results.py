@@ -42,12 +42,13 @@ def _as_product(graph: onnx.GraphProto, layer: onnx.NodeProto, weight: NDArray[n
     stored = added.constant(np.rint(weight / scale[:, None, None, None]).astype(np.int8), f"{name}_quantized")
     added.constant(scale, f"{name}_scale")
     table = added.before(layer, "Squeeze", [stored, added.constant(np.array([2, 3], np.int64))])
-    columns = added.before(layer, "Transpose", [table], perm=(1, 0))
+    columns, scales = added.before(layer, "Transpose", [table], perm=(1, 0)), f"{name}_scale"
     beyond = -len(scale) % _COLUMNS
-    wider = added.before(layer, "Pad", [columns, added.constant(np.array([0, 0, 0, beyond], np.int64))])
-    scales = added.before(layer, "Concat", [f"{name}_scale", added.constant(np.ones(beyond, np.float32))], axis=0)
+    if beyond:
+        columns = added.before(layer, "Pad", [columns, added.constant(np.array([0, 0, 0, beyond], np.int64))])
+        scales = added.before(layer, "Concat", [scales, added.constant(np.ones(beyond, np.float32))], axis=0)
     zeros = added.constant(np.zeros(len(scale) + beyond, np.int8))
-    factors = added.before(layer, "DequantizeLinear", [wider, scales, zeros], axis=1)
+    factors = added.before(layer, "DequantizeLinear", [columns, scales, zeros], axis=1)
     cells = added.before(layer, "Transpose", [read], perm=(0, 2, 3, 1))
     product = added.before(layer, "MatMul", [cells, factors])
     if beyond:

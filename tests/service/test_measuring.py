@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from service.depth_scale import DepthReadings
 from service.geometry.camera import Camera, yaw_from_alpha
 from service.geometry.transforms import Array, pole_camera_pose
-from service.measuring import ERR_TOGETHER, Still, cut_detected, measure, refined
+from service.measuring import ERR_TOGETHER, measure, read_vehicles
 from service.nets.detections import Detections
 from service.nets.detector_spec import DetectorSpec
 from service.nets.error_model import ErrorModel
 from service.nets.multibin import UNCERTAIN, Crops, MultibinEstimates, MultibinSpec, crop_windows
+from service.stills import DetectedVehicles, Still
 
 K = np.array([[600.0, 0.0, 319.5], [0.0, 600.0, 179.5], [0.0, 0.0, 1.0]])
 CAMERA = Camera("north", 640, 360, K, pole_camera_pose([0.0, 0.0, 6.0], 0.3, 0.3))
@@ -47,7 +48,7 @@ def says(xyxy_px: Array | None = None, alpha: float = 0.4) -> MultibinEstimates:
 
 
 def measured(box: list[float], estimates: MultibinEstimates, factor: int = 2):  # type: ignore[no-untyped-def]
-    return measure([still(factor)], [found(box)], estimates, DepthReadings.none(1), DETECTOR, HEAD)
+    return measure(DetectedVehicles.of([still(factor)], [found(box)]), estimates, DepthReadings.none(1), DETECTOR, HEAD)
 
 
 def test_the_detectors_edges_are_told_in_pixels_of_the_large_picture() -> None:
@@ -98,40 +99,39 @@ def test_a_heading_that_is_no_number_may_be_any() -> None:
 
 def test_cameras_keep_their_order_and_none_may_be_empty_handed() -> None:
     nothing = Detections(np.zeros((0, 4)), np.zeros(0), np.zeros(0, np.int64))
-    stills, detections = [still(), still()], [nothing, found(INNER)]
-    assert cut_detected(stills, detections, 48).pixels.shape == (1, 48, 48, 3)
-    told = measure(stills, detections, says(), DepthReadings.none(1), DETECTOR, replace(HEAD))
+    detected = DetectedVehicles.of([still(), still()], [nothing, found(INNER)])
+    assert detected.crops(48).pixels.shape == (1, 48, 48, 3)
+    told = measure(detected, says(), DepthReadings.none(1), DETECTOR, replace(HEAD))
     np.testing.assert_array_equal(told.camera_index, [1])
 
 
 def test_crops_are_cut_from_the_large_picture() -> None:
     one = still()
-    window = cut_detected([one], [found(INNER)], 156).window[0]
-    np.testing.assert_array_equal(window, [182, 82, 156])
-    np.testing.assert_array_equal(cut_detected([one], [found(INNER)], 156).pixels[0], one.image[82:238, 182:338])
+    crops = DetectedVehicles.of([one], [found(INNER)]).crops(156)
+    np.testing.assert_array_equal(crops.window[0], [182, 82, 156])
+    np.testing.assert_array_equal(crops.pixels[0], one.image[82:238, 182:338])
 
 
 class _Recorder:
-    """A head that says the same of every crop, and remembers the windows."""
+    """A head that reads given edges first, and others at a second look; it remembers the windows."""
 
     spec = HEAD
 
-    def __init__(self) -> None:
+    def __init__(self, first: MultibinEstimates) -> None:
         self.windows: list[list[int]] = []
+        self._next = [says(np.array([[210.0, 130.0, 330.0, 210.0]]), alpha=1.0), first]
 
     def estimate(self, crops: Crops, cls: NDArray[np.int64]) -> MultibinEstimates:
         assert len(crops) == len(cls)
         self.windows += crops.window.tolist()
-        return says(np.tile([[210.0, 130.0, 330.0, 210.0]], (len(crops), 1)), alpha=1.0)
+        return self._next.pop()
 
 
 @pytest.mark.parametrize(("shift", "read_again"), [(2.0, False), (12.0, True), (100.0, False)])
 def test_a_vehicle_is_read_again_around_its_own_outline(shift: float, read_again: bool) -> None:
-    head, first = _Recorder(), says(np.array([[200.5, 120.5, 320.5 + shift, 200.5]]))
-    second = refined([still()], [found(INNER)], first, head, 0.05)  # type: ignore[arg-type]
-    assert bool(head.windows) == read_again
-    if read_again:
-        assert head.windows == crop_windows(first.xyxy_px).tolist()
-        assert second.alpha[0] == 1.0
-    else:
-        assert second is first
+    first = says(np.array([[200.5, 120.5, 320.5 + shift, 200.5]]))
+    head, detected = _Recorder(first), DetectedVehicles.of([still()], [found(INNER)])
+    estimates = read_vehicles(detected, head, 0.05)  # type: ignore[arg-type]
+    around = crop_windows(np.concatenate([detected.xyxy_px, first.xyxy_px]))
+    assert head.windows == around[: 1 + read_again].tolist()
+    assert estimates.alpha[0] == (1.0 if read_again else first.alpha[0])
