@@ -9,7 +9,7 @@ import numpy as np
 from service.association import Index
 from service.confidence import mean_score
 from service.geometry.boxes import STATE_DIM, YAW, Boxes, box_states
-from service.geometry.transforms import Array, inverse_2x2, wrap_angle
+from service.geometry.transforms import Array, wrap_angle
 from service.joint import solve_jointly
 from service.residuals import BoxProblem
 from service.solver import SolverSettings
@@ -28,10 +28,11 @@ def summable(boxes: Boxes, cluster: Index) -> Boxes:
     return replace(boxes, covariance=covariance)
 
 
-def combine(boxes: Boxes, cluster: Index, terms: BoxProblem | None, settings: SolverSettings) -> Boxes:
+def combine(boxes: Boxes, cluster: Index, terms: BoxProblem | None, settings: SolverSettings, tail_share: float = 1.0) -> Boxes:
     """One box a cluster from K boxes as :func:`summable` gives them, ``cluster`` (K,) ascending from 0 without gaps.
 
-    With the K boxes' terms, clusters of several are solved from these; else they are combined by information.
+    With the K boxes' terms, clusters of several are solved from these, their tails ``tail_share`` as far out; else they are
+    combined by information.
     """
     rows = int(cluster[-1]) + 1
     first = np.searchsorted(cluster, np.arange(rows))
@@ -48,14 +49,16 @@ def combine(boxes: Boxes, cluster: Index, terms: BoxProblem | None, settings: So
         fused, covariance = _by_information(state, boxes.covariance, first)
         fused += reference
     else:
-        fused, covariance = _means(state, boxes.covariance, cluster, first) + reference, boxes.covariance[first]
+        # Where cameras do not agree the sum has a minimum near each: the surest is right more often than the mean.
+        surest = _surest(boxes.covariance, cluster, first)
+        fused, covariance = state[surest] + reference, boxes.covariance[surest]
         several = np.bincount(cluster) > 1
         if several.all():
-            fused, covariance = solve_jointly(terms, cluster, fused, settings)
+            fused, covariance = solve_jointly(terms, cluster, fused, settings, tail_share)
         elif several.any():
             mine = np.flatnonzero(several[cluster])
             vehicle = (np.cumsum(several) - 1)[cluster[mine]]
-            fused[several], covariance[several] = solve_jointly(terms.take(mine), vehicle, fused[several], settings)
+            fused[several], covariance[several] = solve_jointly(terms.take(mine), vehicle, fused[several], settings, tail_share)
     return Boxes(
         center=fused[:, :3],
         dims_lwh=fused[:, _DIMS],
@@ -76,15 +79,11 @@ def _by_information(state: Array, covariance: Array, first: Index) -> tuple[Arra
     return fused, 0.5 * (fused_covariance + fused_covariance.transpose(0, 2, 1))
 
 
-def _means(state: Array, covariance: Array, cluster: Index, first: Index) -> Array:
-    """Quick states (M, 7) of clusters, where the joint solve begins: place by information, the rest by its own variance."""
-    weight = 1.0 / np.diagonal(covariance, axis1=1, axis2=2)
-    mean: Array = np.add.reduceat(weight * state, first) / np.add.reduceat(weight, first)
-    information = inverse_2x2(covariance[:, :2, :2])
-    weighted = (information @ state[:, :2, None])[..., 0]
-    known = inverse_2x2(np.add.reduceat(information, first))
-    mean[:, :2] = (known @ np.add.reduceat(weighted, first)[..., None])[..., 0]
-    return mean
+def _surest(covariance: Array, cluster: Index, first: Index) -> Index:
+    """The row (M,) in each cluster whose place in the plane is known best."""
+    variance = covariance[:, 0, 0] + covariance[:, 1, 1]
+    surest: Index = np.lexsort((variance, cluster))[first]
+    return surest
 
 
 def _circular_axis(boxes: Boxes, cluster: Index, rows: int) -> Array:

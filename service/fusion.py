@@ -89,6 +89,9 @@ class FusionSettings:
     """What makes a fused box's score."""
     solver: SolverSettings = field(default_factory=SolverSettings)
     """For vehicles of several cameras."""
+    tail_share: float = 1.0
+    """For these, how far out (in sigmas) the tails of the cameras' readings begin, over where they do for one camera: a camera
+    that contradicts a surer one errs as a whole, and should give way."""
 
 
 def fuse(
@@ -184,7 +187,7 @@ def _fuse_and_merge(
     """Fused boxes, their parts and clusters (N,); clusters that turn out to be one vehicle become one."""
     used = _best_per_camera(boxes, owner, cluster)
     parts = summable(boxes.take(used), cluster[used])
-    fused = combine(parts, cluster[used], None if terms is None else terms.take(used), settings.solver)
+    fused = combine(parts, cluster[used], None if terms is None else terms.take(used), settings.solver, settings.tail_share)
     while True:
         everyone = np.zeros(len(fused), np.int64)
         keeper = best_of_duplicates(fused, everyone, settings.duplicate_iou, settings.duplicate_distance_m)
@@ -198,7 +201,9 @@ def _fuse_and_merge(
         changed = np.flatnonzero(np.bincount(renumbered) > 1)
         mine = np.isin(cluster[used], changed)
         its_terms = None if terms is None else terms.take(used[mine])
-        again = combine(parts.take(mine), np.searchsorted(changed, cluster[used][mine]), its_terms, settings.solver)
+        again = combine(
+            parts.take(mine), np.searchsorted(changed, cluster[used][mine]), its_terms, settings.solver, settings.tail_share
+        )
         row = np.arange(len(survivors))
         row[changed] = len(survivors) + np.arange(len(changed))
         fused = Boxes.concatenate([fused.take(survivors), again]).take(row)

@@ -50,15 +50,18 @@ def joint(members: BoxProblem, vehicle: Index) -> JointProblem:
     return JointProblem(members, vehicle, np.flatnonzero(np.diff(vehicle, prepend=-1)))
 
 
-def solve_jointly(terms: BoxProblem, vehicle: Index, start: Array, settings: SolverSettings) -> tuple[Array, Array]:
+def solve_jointly(
+    terms: BoxProblem, vehicle: Index, start: Array, settings: SolverSettings, tail_share: float = 1.0
+) -> tuple[Array, Array]:
     """States (M, 7) and covariances (M, 7, 7) of vehicles, each from the terms of all its cameras.
 
-    terms: K, by ``vehicle`` (K,) ascending. start: (M, 7). The terms' headings count as axes: each is taken from the side, and
-    the turn, that is nearest to the start's; the states' yaw is not wrapped.
+    terms: K, by ``vehicle`` (K,) ascending. start: (M, 7). tail_share: how far out the rows' tails begin, over where they do
+    for one camera. The terms' headings count as axes: each is taken from the side, and the turn, that is nearest to the
+    start's; the states' yaw is not wrapped.
     """
     count = np.bincount(vehicle)[vehicle]
     share = 1.0 / np.sqrt(count)
-    prior, weight, tail = terms.prior.copy(), terms.prior_weight.copy(), terms.tail.copy()
+    prior, weight, tail = terms.prior.copy(), terms.prior_weight.copy(), terms.tail * tail_share
     half_turns = np.round((prior[:, YAW] - start[vehicle, YAW]) / np.pi)
     prior[:, YAW] -= np.pi * half_turns
     weight[:, _SHARED] *= share[:, None]

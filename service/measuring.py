@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +20,9 @@ from service.stills import DetectedVehicles
 ERR_TOGETHER = 1.5
 """What a head's sigmas of edges and tangents are multiplied by: each is honest for itself, but twelve readings of one look at a
 vehicle err together, and do not tell as much as twelve looks (validation scenes; docs: lifting)."""
+_SURE_SCORE, _DOUBT = 0.9, 1.5
+"""A head's sigmas are honest on average, but what a detector doubts the head reads worse than it knows: hidden vehicles, dark
+ones, none. They are multiplied by exp(doubt * (sure - score)) (validation scenes; docs: lifting)."""
 _UNKNOWN_YAW_SIGMA = np.pi / np.sqrt(3.0)
 """Standard deviation of an angle that may be any, radians."""
 
@@ -37,6 +42,9 @@ def measure(
     multibin: MultibinSpec,
 ) -> Measurements:
     """What the networks say of all vehicles, in px of ``image``, each reading with its standard deviation."""
+    if estimates.sigma is not None:
+        doubt = np.exp(_DOUBT * (_SURE_SCORE - detected.score))
+        estimates = replace(estimates, sigma=estimates.sigma * doubt[:, None])
     rows = [detected.still == number for number in range(len(detected.stills))]
     of_stills = list(zip(detected.stills, rows, strict=True))
     seen = np.concatenate([clip_extents(still.camera, detected.xyxy_px[own]) for still, own in of_stills])

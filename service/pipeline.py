@@ -36,12 +36,14 @@ from service.site import Site
 from service.solver import SolverSettings
 from service.stills import DetectedVehicles, Still
 
-CONFIDENCE = Confidence(offset=-5.1, score=1.15, doubt=-3.4, several=-0.85, silent=-0.55)
+CONFIDENCE = Confidence(offset=-3.4, score=0.48, doubt=-3.23, several=-0.24, silent=-0.67)
 """``FusionSettings.confidence`` of a pipeline, fitted on validation scenes (docs: fusion): the score is then about the share of
 such boxes that overlap a vehicle by more than half."""
-TAIL_SIGMAS = 1.0
-"""``LiftSettings.tail_sigmas`` of a pipeline: a network's outline of a vehicle that is partly hidden is a guess, and wrong
-guesses are far off (validation scenes; docs: lifting)."""
+TAIL_SIGMAS, TAIL_SHARE = 1.4, 0.5
+"""``LiftSettings.tail_sigmas`` and ``FusionSettings.tail_share`` of a pipeline: a network's outline of a vehicle that is partly
+hidden is a guess, and wrong guesses are far off (validation scenes; docs: lifting, fusion)."""
+GATE = 6.0
+"""``FusionSettings.gate`` of a pipeline: 95 % of a chi-square with 2 degrees of freedom."""
 SOLVER = SolverSettings(step_tolerance=1.0)
 """Of a pipeline's lifting and fusion: with networks' outlines, steps shorter than a sigma change no AP (docs: fusion)."""
 _WARM_UP_CROPS = 64
@@ -72,7 +74,9 @@ class PipelineSettings:
     lift: LiftSettings = field(default_factory=lambda: LiftSettings(tail_sigmas=TAIL_SIGMAS, solver=SOLVER))
     """How exact the ground is, and for fusion the cameras, a site's own ``accuracy`` says."""
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
-    fusion: FusionSettings = field(default_factory=lambda: FusionSettings(confidence=CONFIDENCE, solver=SOLVER))
+    fusion: FusionSettings = field(
+        default_factory=lambda: FusionSettings(gate=GATE, confidence=CONFIDENCE, solver=SOLVER, tail_share=TAIL_SHARE)
+    )
     paper_fusion: PaperFusionSettings = field(default_factory=PaperFusionSettings)
 
 

@@ -113,6 +113,28 @@ def test_two_cameras_that_are_one_know_size_and_road_no_better():
     np.testing.assert_allclose(twice[:, 6, 6], once[:, 6, 6] / 2, rtol=0.02)
 
 
+def test_a_camera_that_contradicts_a_surer_one_gives_way():
+    """The second camera's outlines lie 25 px too low, and it knows its edges half as well."""
+    truth, measurements = seen(60, np.random.default_rng(6), noise=0.3)
+    second = measurements.camera_index == 1
+    wrong = replace(
+        measurements,
+        xyxy_px=measurements.xyxy_px + 25.0 * second[:, None] * np.array([0.0, 1.0, 0.0, 1.0]),
+        sigma_px=measurements.sigma_px * np.where(second, 1.0, 0.5)[:, None],
+    )
+    boxes, terms = lift_with_terms(cameras(), GroundPlane(), wrong, replace(GROUND, tail_sigmas=1.4))
+    joined = replace(EXACT_CAMERAS, gate=1e4, max_distance_m=20.0, tail_share=0.5)
+    apart = []
+    for number, own in enumerate(np.split(np.arange(120), 60)):
+        fused = fuse(boxes.take(own), np.arange(2), cameras(), joined, terms.take(own)).boxes
+        assert len(fused) == 1
+        centers = np.concatenate([fused.center, boxes.center[own]])
+        apart.append(np.linalg.norm(centers - truth[number, :3], axis=1))
+    ours, surer, other = np.median(apart, axis=0)
+    assert other > 1.0
+    assert ours < 1.2 * surer
+
+
 def test_a_flipped_heading_is_the_same_axis():
     _, measurements = seen(10, np.random.default_rng(4))
     turned = replace(measurements, yaw=wrap_angle(measurements.yaw + np.pi * (np.arange(20) % 2)))

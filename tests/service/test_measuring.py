@@ -37,8 +37,8 @@ def still(factor: int = 2) -> Still:
     return Still(CAMERA, image, image[::factor, ::factor].copy(), image)
 
 
-def found(box: list[float]) -> Detections:
-    return Detections(np.array([box]), np.ones(1), np.zeros(1, np.int64))
+def found(box: list[float], score: float = 0.9) -> Detections:
+    return Detections(np.array([box]), np.array([score]), np.zeros(1, np.int64))
 
 
 def says(xyxy_px: Array | None = None, alpha: float = 0.4) -> MultibinEstimates:
@@ -72,6 +72,17 @@ def test_a_head_that_reads_edges_is_believed_with_its_own_sigmas_as_readings_tha
     np.testing.assert_array_equal(told.sigma_px, ERR_TOGETHER * SURE[:, 4:])
     np.testing.assert_array_equal(told.sigma_dims, SURE[:, 1:4])
     assert told.sigma_yaw[0] == SURE[0, UNCERTAIN.index("alpha")]
+
+
+def test_what_the_detector_doubts_the_head_is_believed_less() -> None:
+    edges = says(np.array([[201.0, 121.0, 322.0, 199.0]]))
+    sure, unsure = (
+        measure(DetectedVehicles.of([still()], [found(INNER, score)]), edges, DepthReadings.none(1), DETECTOR, HEAD)
+        for score in (0.9, 0.3)
+    )
+    for name in ("sigma_px", "sigma_dims", "sigma_yaw"):
+        np.testing.assert_allclose(getattr(unsure, name), np.exp(0.9) * getattr(sure, name))
+    np.testing.assert_array_equal(unsure.xyxy_px, sure.xyxy_px)
 
 
 def test_an_edge_that_the_border_cuts_stays_at_the_border() -> None:
