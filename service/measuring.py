@@ -17,12 +17,9 @@ from service.nets.detector_spec import DetectorSpec
 from service.nets.multibin import EDGES, UNCERTAIN, Multibin, MultibinEstimates, MultibinSpec
 from service.stills import DetectedVehicles
 
-ERR_TOGETHER = 1.5
-"""What a head's sigmas of edges and tangents are multiplied by: each is honest for itself, but twelve readings of one look at a
-vehicle err together, and do not tell as much as twelve looks (validation scenes; docs: lifting)."""
-_SURE_SCORE, _DOUBT = 0.9, 1.5
+DOUBT = 1.5
 """A head's sigmas are honest on average, but what a detector doubts the head reads worse than it knows: hidden vehicles, dark
-ones, none. They are multiplied by exp(doubt * (sure - score)) (validation scenes; docs: lifting)."""
+ones, none. They are multiplied by exp(doubt * (1 - score)) (validation scenes; docs: lifting)."""
 _UNKNOWN_YAW_SIGMA = np.pi / np.sqrt(3.0)
 """Standard deviation of an angle that may be any, radians."""
 
@@ -43,7 +40,7 @@ def measure(
 ) -> Measurements:
     """What the networks say of all vehicles, in px of ``image``, each reading with its standard deviation."""
     if estimates.sigma is not None:
-        doubt = np.exp(_DOUBT * (_SURE_SCORE - detected.score))
+        doubt = np.exp(DOUBT * (1.0 - detected.score))
         estimates = replace(estimates, sigma=estimates.sigma * doubt[:, None])
     rows = [detected.still == number for number in range(len(detected.stills))]
     of_stills = list(zip(detected.stills, rows, strict=True))
@@ -87,7 +84,7 @@ def _outline(
         small = (seen + 0.5) / scale - 0.5
         return seen, edge_sigma(detector, small, detected.score, cut.any(1)) * scale, nothing, nothing
     edges = np.where(cut, seen, estimates.xyxy_px)
-    sigma = ERR_TOGETHER * estimates.sigma[:, len(UNCERTAIN) - EDGES :]
+    sigma = estimates.sigma[:, len(UNCERTAIN) - EDGES :]
     if estimates.tangents_px is None:
         return edges, sigma, nothing, nothing
     return edges, sigma[:, :EDGES], estimates.tangents_px, sigma[:, EDGES:]

@@ -36,7 +36,7 @@ from service.site import Site
 from service.solver import SolverSettings
 from service.stills import DetectedVehicles, Still
 
-CONFIDENCE = Confidence(offset=-3.4, score=0.48, doubt=-3.23, several=-0.24, silent=-0.67)
+CONFIDENCE = Confidence(offset=-3.7, score=0.48, doubt=-3.4, several=-0.5, silent=-0.8)
 """``FusionSettings.confidence`` of a pipeline, fitted on validation scenes (docs: fusion): the score is then about the share of
 such boxes that overlap a vehicle by more than half."""
 TAIL_SIGMAS, TAIL_SHARE = 1.4, 0.5

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from service.depth_scale import DepthReadings
 from service.geometry.camera import Camera, yaw_from_alpha
 from service.geometry.transforms import Array, pole_camera_pose
-from service.measuring import ERR_TOGETHER, measure, read_vehicles
+from service.measuring import DOUBT, measure, read_vehicles
 from service.nets.detections import Detections
 from service.nets.detector_spec import DetectorSpec
 from service.nets.error_model import ErrorModel
@@ -37,7 +37,7 @@ def still(factor: int = 2) -> Still:
     return Still(CAMERA, image, image[::factor, ::factor].copy(), image)
 
 
-def found(box: list[float], score: float = 0.9) -> Detections:
+def found(box: list[float], score: float = 1.0) -> Detections:
     return Detections(np.array([box]), np.array([score]), np.zeros(1, np.int64))
 
 
@@ -65,11 +65,11 @@ def test_at_one_size_nothing_is_scaled() -> None:
     np.testing.assert_allclose(told.sigma_px, 1.0)
 
 
-def test_a_head_that_reads_edges_is_believed_with_its_own_sigmas_as_readings_that_err_together() -> None:
+def test_a_head_that_reads_edges_is_believed_with_its_own_sigmas() -> None:
     edges = np.array([[201.0, 121.0, 322.0, 199.0]])
     told = measured(INNER, says(edges))
     np.testing.assert_array_equal(told.xyxy_px, edges)
-    np.testing.assert_array_equal(told.sigma_px, ERR_TOGETHER * SURE[:, 4:])
+    np.testing.assert_array_equal(told.sigma_px, SURE[:, 4:])
     np.testing.assert_array_equal(told.sigma_dims, SURE[:, 1:4])
     assert told.sigma_yaw[0] == SURE[0, UNCERTAIN.index("alpha")]
 
@@ -78,10 +78,10 @@ def test_what_the_detector_doubts_the_head_is_believed_less() -> None:
     edges = says(np.array([[201.0, 121.0, 322.0, 199.0]]))
     sure, unsure = (
         measure(DetectedVehicles.of([still()], [found(INNER, score)]), edges, DepthReadings.none(1), DETECTOR, HEAD)
-        for score in (0.9, 0.3)
+        for score in (1.0, 0.4)
     )
     for name in ("sigma_px", "sigma_dims", "sigma_yaw"):
-        np.testing.assert_allclose(getattr(unsure, name), np.exp(0.9) * getattr(sure, name))
+        np.testing.assert_allclose(getattr(unsure, name), np.exp(0.6 * DOUBT) * getattr(sure, name))
     np.testing.assert_array_equal(unsure.xyxy_px, sure.xyxy_px)
 
 
