@@ -13,8 +13,6 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Literal, get_args
 
-import onnxruntime as ort
-
 from service.errors import InputError, PackError
 
 logger = logging.getLogger(__name__)
@@ -47,6 +45,9 @@ class Choice:
 
 def offered() -> list[str]:
     """What is installed: the providers that ONNX Runtime was built with, by its names, and OpenVINO."""
+    # Imported here: the settings, and with them `--help`, only want the names.
+    import onnxruntime as ort
+
     return [*ort.get_available_providers(), *([_OPENVINO] if find_spec(_OPENVINO) else [])]
 
 
