@@ -1,19 +1,23 @@
 """A network that OpenVINO computes, with as much of the face of an ONNX Runtime session as :class:`Network` looks at.
 
 On x86-64 processors OpenVINO computes int8 convolutions about twice as fast as ONNX Runtime. It is an optional dependency: this
-module is imported where it was chosen.
+module is imported where it was chosen. Its Python package reports its use to its maker when it is imported; here it cannot.
 """
 
 from __future__ import annotations
 
 import queue
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import openvino
 from numpy.typing import NDArray
+
+# Without the package that sends its reports OpenVINO sends none. A service sends nothing that nobody asked it for.
+sys.modules["openvino_telemetry"] = None  # type: ignore[assignment]
+import openvino  # noqa: E402
 
 _METADATA = ["framework"]
 _PROPERTIES = {
