@@ -6,8 +6,7 @@ import platform
 from datetime import UTC, datetime
 from pathlib import Path
 
-import onnxruntime
-
+from service.nets.quiet_onnxruntime import ort
 from service.settings import usable_cores
 
 
@@ -18,7 +17,7 @@ def describe_machine() -> dict[str, str | int]:
         "cores": usable_cores(),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        "onnxruntime": onnxruntime.__version__,
+        "onnxruntime": ort.__version__,
         "date": datetime.now(UTC).date().isoformat(),
     }
 

@@ -5,6 +5,10 @@ from __future__ import annotations
 import warnings
 
 import onnx
+
+import service.nets.quiet_onnxruntime as _  # noqa: F401
+
+# isort: split
 from onnxruntime.transformers.float16 import convert_float_to_float16
 
 

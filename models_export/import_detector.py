@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import NDArray
 
 from models_export.detector_pack import open_base, write_detector_pack
@@ -24,6 +23,7 @@ from service.nets.canvas import InputFit
 from service.nets.detector_spec import DetectorSpec, Format
 from service.nets.error_model import ErrorModel
 from service.nets.pack import Manifest, Pack, open_network, session_options
+from service.nets.quiet_onnxruntime import ort
 
 UNKNOWN_LICENCE = "unknown: as the model's author says"
 _TEST_IMAGE_SIZE = (640, 360)

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import NDArray
 
 from service.errors import NotFoundError
@@ -21,6 +20,7 @@ from service.nets.detector import NMS_IOU, SCORE_THRESHOLD
 from service.nets.detector_spec import DROPPED, DetectorSpec
 from service.nets.error_model import ErrorModel
 from service.nets.pack import session_options
+from service.nets.quiet_onnxruntime import ort
 
 WEIGHTS = "teacher_nanodet_g_416.onnx"
 SIDE_PX = 416

@@ -8,13 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import onnxruntime as ort
 from numpy.typing import NDArray
-from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
 
 from models_export.int8.float_results import multiply_in_int8
 from models_export.int8.pixel_reading import PIXEL_STEP, PIXEL_ZERO, normalised_pixels, read_as_quantized, read_in_groups
 from models_export.int8.upsampling import repeat_cells
+from service.nets.quiet_onnxruntime import ort
+
+# isort: split
+from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantFormat, QuantType, quantize_static
 
 QUANTIZED_OPS = ["Conv", "Relu", "Add", "Resize", "MatMul", "Gemm", "Concat", "MaxPool", "AveragePool"]
 """Operators that run in int8; all others stay in float. Relu is among them so that chains of convolutions stay in int8."""

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Annotated, Any, Protocol
 
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from service.errors import PackError
 from service.nets.providers import Choice, Provider, choose, offered, session_providers, settled
+from service.nets.quiet_onnxruntime import ort
 
 logger = logging.getLogger(__name__)
 

@@ -46,7 +46,7 @@ class Choice:
 def offered() -> list[str]:
     """What is installed: the providers that ONNX Runtime was built with, by its names, and OpenVINO."""
     # Imported here: the settings, and with them `--help`, only want the names.
-    import onnxruntime as ort
+    from service.nets.quiet_onnxruntime import ort
 
     return [*ort.get_available_providers(), *([_OPENVINO] if find_spec(_OPENVINO) else [])]
 
