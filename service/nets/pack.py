@@ -153,11 +153,8 @@ def load_pack(name_or_path: str, *, provider: Provider = "auto", intra_op_thread
     for name in REQUIRED_NETWORKS:
         if name not in manifest.networks:
             raise PackError(f"no network '{name}'.", field=f"{folder.name}/manifest.json", remedy="Export the pack again.")
-    if choice.provider == "openvino" and not any(entry.openvino for entry in manifest.networks.values()):
-        if choice.is_required:
-            remedy = "Export it with int8 networks, or set 'auto'."
-            raise PackError("no network has a form for OpenVINO.", field=f"{folder.name}/manifest.json", remedy=remedy)
-        choice = _ON_CPU
+    if choice.provider == "openvino":
+        choice = _openvino_or_cpu(choice, folder, manifest)
     networks = {}
     for name, entry in manifest.networks.items():
         model = _read_file(folder, entry)
@@ -171,6 +168,29 @@ def load_pack(name_or_path: str, *, provider: Provider = "auto", intra_op_thread
     pack = Pack(folder, manifest, networks)
     logger.info("pack %s runs on %s (asked for: %s)", manifest.name, pack.provider, provider)
     return pack
+
+
+def _openvino_or_cpu(choice: Choice, folder: Path, manifest: Manifest) -> Choice:
+    """The choice of OpenVINO, or the CPU where ``auto`` made it and the pack has nothing for it, or it does not start.
+
+    Raises PackError where it was asked for by name.
+    """
+    try:
+        # Imported here: an optional dependency, and large.
+        import service.nets.openvino_session  # noqa: F401
+
+        fault = None
+    except ImportError as error:
+        fault = f"OpenVINO does not start: {error}."
+        logger.warning("%s", fault)
+    if fault is None and not any(entry.openvino for entry in manifest.networks.values()):
+        fault = "no network has a form for OpenVINO."
+    if fault is None:
+        return choice
+    if choice.is_required:
+        remedy = "Mend the installation or the pack (`quadlift export`), or set 'auto'."
+        raise PackError(fault, field=f"{folder.name}/manifest.json", remedy=remedy)
+    return _ON_CPU
 
 
 def session_options(intra_op_threads: int) -> ort.SessionOptions:
@@ -201,7 +221,7 @@ def open_network(name: str, model: bytes, intra_op_threads: int = 1, choice: Cho
 
 def open_with_openvino(name: str, model: bytes, intra_op_threads: int, concurrent_runs: int) -> Network:
     """A network from the bytes of an ONNX file, computed by OpenVINO. Raises PackError as :func:`open_network` does."""
-    # Imported here: an optional dependency, and large.
+    # Imported here: an optional dependency.
     from service.nets.openvino_session import OpenVinoSession
 
     _require_self_contained(name, model)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -88,6 +89,17 @@ def test_a_pack_without_the_form_stays_with_onnx_runtime(pack_copy: Path) -> Non
     assert load_pack(str(pack_copy)).provider == "cpu"
     with pytest.raises(PackError, match=r"no network has a form for OpenVINO.*set 'auto'"):
         load_pack(str(pack_copy), provider="openvino")
+
+
+def test_a_broken_installation_is_named_where_it_was_asked_for_and_passed_by_elsewhere(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    # So importing it fails, as where a library that OpenVINO needs is missing.
+    monkeypatch.setitem(sys.modules, "service.nets.openvino_session", None)
+    assert load_pack("edge").provider == "cpu"
+    assert "OpenVINO does not start" in caplog.text
+    with pytest.raises(PackError, match="OpenVINO does not start"):
+        load_pack("edge", provider="openvino")
 
 
 def test_a_form_that_is_no_model_is_refused(pack_copy: Path) -> None:
