@@ -70,7 +70,7 @@ def clip_command(
 @app.command("roadside")
 def roadside_command(pack: PackOption = "edge", detector_width: WidthOption = None, as_json: JsonOption = False) -> None:
     """Three real roadside cameras against a LiDAR system's tracks (needs the recording)."""
-    settings = PipelineSettings(detector_width=detector_width)
+    settings = PipelineSettings(detector_width=detector_width, min_fused_score=0.0)
     _report("roadside", pack, lambda pipeline: score_roadside(pipeline, open_roadside_clip()), as_json, settings)
 
 

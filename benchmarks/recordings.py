@@ -14,9 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from service.errors import NotFoundError
 from service.geometry.boxes import clip_extents, project_extents
+from service.geometry.camera import Camera
 from service.geometry.transforms import Array, invert_rigid, rigid, transform_points, wrap_angle
 from service.site import Site, parse_site
 
@@ -69,12 +71,21 @@ class RoadsideClip:
     def reference_2d(self, camera_id: str, step: int) -> Array:
         """Image boxes (N, 4) of the reference vehicles that the protocol counts in a camera."""
         camera = self.site.camera(camera_id)
-        extents, in_front = project_extents(camera, *self.reference(step))
-        clipped = clip_extents(camera, extents)
-        area = np.prod(clipped[:, 2:] - clipped[:, :2], axis=1)
-        full = np.maximum(np.prod(extents[:, 2:] - extents[:, :2], axis=1), 1e-9)
-        tall = clipped[:, 3] - clipped[:, 1] >= MIN_HEIGHT_PX
-        return clipped[in_front & (area / full > MIN_INSIDE) & tall]
+        shown, is_inside = shown_extents(camera, *self.reference(step))
+        tall = shown[:, 3] - shown[:, 1] >= MIN_HEIGHT_PX
+        return shown[is_inside & tall]
+
+
+def shown_extents(camera: Camera, center: Array, dims_lwh: Array, yaw: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Image boxes (N, 4) of boxes in the world, clipped to the image, px; and which (N,) the protocol takes as shown.
+
+    These lie before the camera with all corners, and with more than ``MIN_INSIDE`` of their area in the image.
+    """
+    extents, in_front = project_extents(camera, center, dims_lwh, yaw)
+    clipped = clip_extents(camera, extents)
+    area = np.prod(clipped[:, 2:] - clipped[:, :2], axis=1)
+    full = np.maximum(np.prod(extents[:, 2:] - extents[:, :2], axis=1), 1e-9)
+    return clipped, in_front & (area / full > MIN_INSIDE)
 
 
 def open_roadside_clip() -> RoadsideClip:

@@ -20,8 +20,10 @@ Load = Callable[[Settings], FrameSetRunner]
 def load_pipeline(settings: Settings) -> Pipeline:
     """The service's own pipeline on the pack that the settings name. Raises PackError or InputError."""
     options = PipelineSettings(hard_mode=settings.hard_mode, detector_width=settings.detector_width)
-    if (threshold := settings.score_threshold) is not None:
-        options = replace(options, score_threshold=threshold, min_fused_score=threshold)
+    if settings.score_threshold is not None:
+        options = replace(options, score_threshold=settings.score_threshold)
+    if settings.min_fused_score is not None:
+        options = replace(options, min_fused_score=settings.min_fused_score)
     pack = load_pack(
         settings.pack,
         provider=settings.provider,

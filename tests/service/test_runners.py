@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.clip_sets import clip_frame_sets
 from service.errors import PackError
-from service.pipeline import Pipeline
+from service.pipeline import Pipeline, PipelineSettings
 from service.runners import load_pipeline, make_runner
 from service.settings import Settings
 from service.worker_processes import ProcessRunner
@@ -32,6 +32,17 @@ def test_kinds_of_workers(monkeypatch: pytest.MonkeyPatch, kind: Any, gpu: bool,
 def test_a_pack_that_is_not_there_is_an_error_here() -> None:
     with pytest.raises(PackError):
         make_runner(Settings(pack="no-such-pack", workers=2))
+
+
+def test_each_threshold_is_set_by_itself() -> None:
+    def thresholds(**given: float) -> tuple[float, float]:
+        settings = load_pipeline(Settings(workers=1, provider="cpu", **given)).settings  # type: ignore[arg-type]
+        return settings.score_threshold, settings.min_fused_score
+
+    own = PipelineSettings()
+    assert thresholds() == (own.score_threshold, own.min_fused_score)
+    assert thresholds(score_threshold=0.4) == (0.4, own.min_fused_score)
+    assert thresholds(min_fused_score=0.0) == (own.score_threshold, 0.0)
 
 
 def test_a_process_gives_the_pipelines_own_boxes() -> None:
