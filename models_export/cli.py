@@ -1,4 +1,4 @@
-"""Command lines ``quadlift train`` and ``quadlift export``."""
+"""Command lines ``quadlift train``, ``quadlift average`` and ``quadlift export``."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from models_export.guided import export_guided, train_guided
 from models_export.packing import ExportOptions, export
 from models_export.paper import paper_recipe
 from models_export.recipe import PackRecipe, train
+from models_export.train.averaging import average_runs
 from models_export.train.config import TrainConfig
 from models_export.train.guided import GuidedTask
 from service.errors import InputError, QuadliftError
@@ -25,6 +26,7 @@ ALL = "all"
 GUIDED = GuidedTask.name
 train_app = typer.Typer(add_completion=False)
 export_app = typer.Typer(add_completion=False)
+average_app = typer.Typer(add_completion=False)
 console = Console()
 
 
@@ -136,6 +138,19 @@ def export_command(
     files = [file for entry in manifest.networks.values() for file in (entry, entry.openvino) if file is not None]
     size = sum((out / file.file).stat().st_size for file in files)
     console.print(f"pack '{manifest.name}' in {out}: {size / 1e6:.1f} MB")
+
+
+@average_app.command()
+def average_command(
+    checkpoints: Annotated[list[Path], typer.Argument(help="Checkpoints of one network, each begun where another ended.")],
+    out: Annotated[Path, typer.Option(help="Checkpoint to write: NETWORK.pt in the folder that is exported.")],
+) -> None:
+    """Make several runs of a network one: the mean of their weights, to be exported or begun from."""
+    try:
+        average_runs(checkpoints, out)
+    except QuadliftError as error:
+        raise _failed(error) from None
+    console.print(f"mean of {len(checkpoints)} runs in {out}")
 
 
 def _recipe(pack: PackName) -> PackRecipe:

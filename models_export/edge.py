@@ -25,7 +25,7 @@ def edge_recipe(
     """The pack as it is shipped, or with networks of other shapes."""
     return PackRecipe(
         name="edge",
-        version="8",
+        version="9",
         networks=(
             _detector(detector or DetectorConfig()),
             _multibin(multibin or MultibinConfig()),

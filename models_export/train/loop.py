@@ -108,8 +108,10 @@ class _Run:
         write_curves(self.checkpoint.parent, self.task.name, self.history, self.validation)
 
     def restore(self) -> None:
-        """Go back to where the checkpoint was written. Raises InputError when it is of another run."""
+        """Go back to where the checkpoint was written. Raises InputError when it is of another run, or of several."""
         saved = read_checkpoint(self.checkpoint)
+        if "optimizer" not in saved:
+            raise InputError("is a mean of runs.", field=str(self.checkpoint), remedy="Begin from it with --init.")
         require_same(self.checkpoint, decisive(saved["config"]), decisive(asdict(self.config)), "config")
         require_same(self.checkpoint, saved["task"], self.task.describe(), "task")
         for key, part in self._parts().items():

@@ -15,12 +15,13 @@ from torch import Tensor, nn
 from models_export.data.ahead import mapped_ahead
 from models_export.data.augment import NO_AUGMENT, AugmentConfig, border_within, hidden_behind, photometric
 from models_export.data.detection import VehicleSample
+from models_export.data.mix import draw_by_odds
 from models_export.data.vehicles import Vehicle, vehicles_of
 from models_export.losses import likelihood_loss, multibin_loss, places_loss
 from models_export.nets.multibin import SIGMA_UNITS, EdgeMultibin, MultibinConfig, outline_places
 from models_export.nets.vgg_multibin import VggMultibinConfig
-from models_export.train.task import Batch, ParameterGroup, decayed_groups, draw_uniform
-from service.geometry.boxes import TANGENT_DEGREES
+from models_export.train.task import Batch, ParameterGroup, decayed_groups
+from service.geometry.boxes import TANGENT_DEGREES, cut_edges
 from service.geometry.transforms import Array
 
 JITTER, MAX_JITTER = 0.08, 0.2
@@ -28,8 +29,11 @@ JITTER, MAX_JITTER = 0.08, 0.2
 SIZE_WEIGHT, OUTLINE_WEIGHT, PLACES_WEIGHT = 4.0, 2.0, 6.0
 """Of the likelihoods of size and outline, and of the outline's places, over the angle's. At 1 the head learned little more of a
 size than its class's mean; the outline is what the lift takes sizes and places from."""
-CROP_AUGMENT = AugmentConfig(motion_px=4, jpeg_quality=(40, 95), noise_sigma=8.0, night=0.06, fog=0.06, hidden=0.3, cut=0.25)
+CROP_AUGMENT = AugmentConfig(motion_px=4, jpeg_quality=(40, 95), noise_sigma=8.0, night=0.06, fog=0.06, hidden=0.3, cut=0.35)
 """Milder than a picture's: a crop is a few dozen pixels of it, and streaks and blocks do not shrink with it."""
+_PLAIN_HEIGHT, _LEAST_ODDS, _MOST_ODDS, _CUT_ODDS = 30 / 672, 0.4, 2.5, 1.5
+"""A vehicle is drawn as often as it is high, over a plain one's share of the picture's width, within limits; more often when
+the border cuts it. Near vehicles, of which the picture often shows a part, are those whose boxes are wrong most often."""
 _MIRRORED = [2, 1, 0, 3, *(4 + TANGENT_DEGREES.index((180 - angle) % 360) for angle in TANGENT_DEGREES)]
 _MIRRORED_SIGN = [-1.0, 1.0, -1.0, 1.0, *(1.0,) * len(TANGENT_DEGREES)]
 """Where each reading of the outline comes from in the mirror, and its sign: edges are coordinates, tangents lengths."""
@@ -50,6 +54,7 @@ class MultibinTask:
     ) -> None:
         """build: the head of a configuration, which gets the vehicles' mean sizes as its priors."""
         self.vehicles = _vehicles(samples, config)
+        self.odds = vehicle_odds(self.vehicles)
         self.config = replace(config, mean_dims_lwh=mean_dims(self.vehicles, len(config.classes)))
         self.augment = augment or CROP_AUGMENT
         self.net = build(self.config)
@@ -65,11 +70,12 @@ class MultibinTask:
         """The same network and configuration over other samples, which are not augmented: for validation."""
         other = copy(self)
         other.vehicles, other.augment = _vehicles(samples, self.config), NO_AUGMENT
+        other.odds = vehicle_odds(other.vehicles)
         return other
 
     def draw(self, rng: np.random.Generator, size: int) -> NDArray[np.int64]:
-        """Every vehicle is as likely as the others."""
-        return draw_uniform(rng, len(self), size)
+        """Vehicles by their odds."""
+        return draw_by_odds(rng, self.odds, size)
 
     def labels(self, index: int) -> dict[str, str]:
         """Camera and weather of a vehicle's frame."""
@@ -136,6 +142,14 @@ def angle_error(vectors: Tensor, alpha: Tensor, bin_centers: Tensor) -> Tensor:
     delta = delta.gather(1, nearest)[:, 0]
     cosine, sine = vectors.gather(1, nearest[..., None].expand(-1, -1, 2))[:, 0].unbind(-1)
     return torch.atan2(sine * delta.cos() - cosine * delta.sin(), cosine * delta.cos() + sine * delta.sin())
+
+
+def vehicle_odds(vehicles: list[Vehicle]) -> Array:
+    """Probabilities (N,) of drawing each vehicle: large and cut ones more often (``_PLAIN_HEIGHT``)."""
+    height = np.array([(v.xyxy_px[3] - v.xyxy_px[1]) / v.camera.width for v in vehicles])
+    is_cut = np.array([cut_edges(v.camera, v.xyxy_px[None]).any() for v in vehicles], dtype=bool)
+    odds = np.clip(height / _PLAIN_HEIGHT, _LEAST_ODDS, _MOST_ODDS) * np.where(is_cut, _CUT_ODDS, 1.0)
+    return odds / odds.sum()
 
 
 def mean_dims(vehicles: list[Vehicle], classes: int) -> tuple[tuple[float, float, float], ...]:

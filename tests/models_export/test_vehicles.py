@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from models_export.data.augment import AugmentConfig, border_within
 from models_export.data.detection import VehicleSample
 from models_export.data.vehicles import Vehicle, vehicles_of
-from models_export.train.multibin import MAX_JITTER, jittered, mirrored_outline
+from models_export.train.multibin import MAX_JITTER, jittered, mirrored_outline, vehicle_odds
 from service.geometry.boxes import tangents_of
 from service.geometry.camera import Camera, ray_azimuth
 from service.geometry.transforms import Array, pole_camera_pose, wrap_angle
@@ -131,3 +134,22 @@ def test_a_border_leaves_a_part_of_the_vehicle(seed: int) -> None:
     assert np.isfinite(border).sum() in (1, 2)
     assert np.isfinite(border[[0, 2]]).sum() <= 1
     assert np.isfinite(border[[1, 3]]).sum() <= 1
+
+
+def test_high_and_cut_vehicles_are_drawn_more_often() -> None:
+    def at(xyxy: list[float]) -> Vehicle:
+        return replace(white_box([200, 100, 240, 130]), xyxy_px=np.array(xyxy))
+
+    # 30 px high in a picture 672 px wide is plain; this one is 400 px wide.
+    plain = 30 * 400 / 672
+    odds = vehicle_odds(
+        [
+            at([200, 100, 240, 100 + plain]),
+            at([200, 100, 240, 100 + 2 * plain]),
+            at([200, 20, 240, 20 + 9 * plain]),
+            at([200, 100, 203, 102]),
+            at([359, 100, 399, 100 + plain]),
+        ]
+    )
+    assert odds.sum() == pytest.approx(1)
+    np.testing.assert_allclose(odds / odds[0], [1.0, 2.0, 2.5, 0.4, 1.5])
