@@ -21,6 +21,8 @@ from benchmarks.load.raw_http import endless_bodies, fuzz_raw
 from clients.client import socket_url
 
 PROGRAM = "from benchmarks.load.attackers import main; main()"
+CONTROL = "bystander"
+"""The attacker that is there to be compared with."""
 
 
 async def raw_http(url: str, site: str, seconds: float, seed: int) -> dict[str, Any]:
@@ -59,7 +61,17 @@ async def camera_streams(url: str, site: str, seconds: float, seed: int) -> dict
     return {"messages": sent, "connections_cut": cut}
 
 
+async def bystander(url: str, site: str, seconds: float, seed: int) -> dict[str, Any]:
+    """No attack: works as hard as one core can and sends nothing. What it costs the honest client, the machine costs."""
+    until, rounds = time.monotonic() + seconds, 0
+    while time.monotonic() < until:
+        sum(range(10_000))
+        rounds += 1
+    return {"rounds": rounds}
+
+
 ATTACKERS: dict[str, Callable[[str, str, float, int], Awaitable[dict[str, Any]]]] = {
+    CONTROL: bystander,
     "raw_http": raw_http,
     "endless_bodies": endless,
     "camera_streams": camera_streams,

@@ -116,6 +116,8 @@ async def run_attacks(names: list[str], seconds: float, seed: int) -> dict[str, 
         try:
             async with asyncio.timeout(2 * seconds + 3 * _SLACK_S):
                 figures[name] = await _run_one(ATTACKS[name], seconds, seed)
+            if name == attackers.CONTROL:
+                figures[name]["passed"] = figures[name]["alive"]
         except (TimeoutError, LocalServiceError, ServiceError, httpx.HTTPError, OSError) as error:
             figures[name] = {"passed": False, "failed": f"{type(error).__name__}: {str(error)[:_SHOWN]}"}
     return figures

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from benchmarks.load import attackers, attacks
 from benchmarks.load.fault_load import Account, load_site
 from benchmarks.load.faults import FaultResult, counted
 from benchmarks.load.faulty_service import FaultyRunner, NetworkFault, fault_file
 from benchmarks.load.honest import Watched, compare
-from benchmarks.load.target_service import Counters
+from benchmarks.load.target_service import Counters, Target
 from clients.clip import open_clip
 from service.frames import EncodedFrame, FrameSet
 from service.pipeline import SetResult
@@ -129,3 +132,16 @@ def test_limits_of_an_attack() -> None:
     assert not compare(calm, Watched(latencies_ms=[14.0] * 9, rss_bytes=[165 * 2**20]))["kept_limits"]
     assert not compare(calm, Watched(rss_bytes=[100 * 2**20]))["kept_limits"]
     assert not compare(calm, Watched(latencies_ms=[9.0], failures=Counter({"503": 1}), rss_bytes=[1]))["kept_limits"]
+
+
+def test_a_bystander_is_measured_and_not_judged(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    async def run_one(attack: attacks.Attack, seconds: float, seed: int) -> dict[str, Any]:
+        nobody = Target("http://127.0.0.1:9", None, tmp_path)  # type: ignore[arg-type]
+        own = await attack(nobody, open_clip(), seconds, seed)
+        return own | {"honest_growth": 9.0, "alive": True, "passed": False}
+
+    monkeypatch.setattr(attacks, "_run_one", run_one)
+    figures = asyncio.run(attacks.run_attacks([attackers.CONTROL, "raw_http"], 0.1, 1))
+    assert figures[attackers.CONTROL]["passed"]
+    assert figures[attackers.CONTROL]["rounds"] > 0
+    assert not figures["raw_http"]["passed"]
