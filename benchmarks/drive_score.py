@@ -98,7 +98,9 @@ def match(ours: Array, truth: Array, ignored: Array) -> tuple[NDArray[np.bool_],
     return taken, int((outcome == 0).sum())
 
 
-def outcomes(ours: Array, truth: Array, ignored: Array) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+def outcomes(
+    ours: Array, truth: Array, ignored: Array, min_iou: float = MIN_IOU
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """As :func:`match`: which vehicles (N,) are found, and what became of each box (K,): 1 right, 0 false, -1 left out."""
     overlap = iou_2d(ours, truth)
     taken = np.zeros(len(truth), dtype=bool)
@@ -106,7 +108,7 @@ def outcomes(ours: Array, truth: Array, ignored: Array) -> tuple[NDArray[np.bool
     for row, excused in enumerate(_part_on(ours, ignored) > MIN_ON_IGNORED):
         free = np.where(taken, 0.0, overlap[row])
         best = int(free.argmax()) if len(free) else -1
-        if best >= 0 and free[best] > MIN_IOU:
+        if best >= 0 and free[best] > min_iou:
             taken[best] = True
             outcome[row] = 1
         elif excused:
