@@ -68,10 +68,10 @@ class Settings(BaseSettings):
     max_abandoned: Annotated[int, Field(ge=0, le=256)] = 4
     """Threads that may hang while others take their place. One more, and the service is not ready until one comes back."""
     score_threshold: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Detections in a camera's picture of a lower score are left out. Unset: 0.3."""
+    """Detections in a camera's picture of a lower score are left out. Unset: the pipeline's own threshold."""
     min_fused_score: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Fused boxes of a lower score, which says how surely a box fits its vehicle, are left out. Unset: 0.2. Lower shows more of
-    the far vehicles, whose place is vague (docs: fusion)."""
+    """Fused boxes of a lower score, which says how surely a box fits its vehicle, are left out. Unset: the pipeline's
+    own threshold. Lower shows more of the far vehicles, whose place is vague (docs: fusion)."""
     detector_width: Annotated[int, Field(ge=64, le=4096)] | None = None
     """All pictures are brought to this width for the detector and the depth net, px. Unset: only those that are wider than the
     pack says, to that. More finds smaller vehicles, also where it enlarges, in time that grows with its square."""

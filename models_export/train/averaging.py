@@ -37,6 +37,7 @@ def average_runs(checkpoints: Sequence[Path], out: Path) -> None:
             )
     means = {key: _mean([state["averaged"][key] for state in states]) for key in last["averaged"]}
     runs = [f"seed {state['config']['seed']}, {state['step']} steps" for state in states]
+    out.parent.mkdir(parents=True, exist_ok=True)
     kept = {key: last[key] for key in ("step", "config", "task")}
     write_checkpoint(out, {**kept, "averaged": means, "config": {**last["config"], "mean_of_runs": runs}})
 

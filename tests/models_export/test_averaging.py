@@ -39,9 +39,9 @@ def runs(toy_samples: list[Sample], tmp_path_factory: pytest.TempPathFactory) ->
 def test_the_weights_are_means_and_the_record_names_the_runs(
     runs: list[Path], toy_samples: list[Sample], tmp_path: Path
 ) -> None:
-    result = CliRunner().invoke(average_app, [*map(str, runs), "--out", str(tmp_path / "multibin.pt")])
+    result = CliRunner().invoke(average_app, [*map(str, runs), "--out", str(tmp_path / "new" / "multibin.pt")])
     assert result.exit_code == 0, result.output
-    mean, states = read_checkpoint(tmp_path / "multibin.pt"), [read_checkpoint(path) for path in runs]
+    mean, states = read_checkpoint(tmp_path / "new" / "multibin.pt"), [read_checkpoint(path) for path in runs]
     for key, value in mean["averaged"].items():
         parts = [state["averaged"][key] for state in states]
         expected = np.mean([part.numpy() for part in parts], 0) if value.is_floating_point() else parts[-1].numpy()
@@ -49,9 +49,9 @@ def test_the_weights_are_means_and_the_record_names_the_runs(
     assert mean["config"]["mean_of_runs"] == [f"seed {seed}, 3 steps" for seed in (1, 2, 3)]
     # A new run may begin from it; the mean itself is no run to go on with.
     task = MultibinTask(toy_samples, SMALL)
-    load_checkpoint(task.net, tmp_path / "multibin.pt")
+    load_checkpoint(task.net, tmp_path / "new" / "multibin.pt")
     with pytest.raises(InputError, match="mean of runs"):
-        fit(task, SHORT, tmp_path, resume=True)
+        fit(task, SHORT, tmp_path / "new", resume=True)
 
 
 def test_runs_of_other_networks_are_refused(runs: list[Path], toy_samples: list[Sample], tmp_path: Path) -> None:
